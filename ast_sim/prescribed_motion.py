@@ -232,6 +232,15 @@ class Motion:
         start, *moved = self._prescribed(scene)
         return max(_largest(after - start) for after in moved)
 
+    def extent(self, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+        """[3] and [3]: the lowest and the highest displacement of a prescribed node from its position in frame 0, along
+        x, y and z. Frame 0 counts, so the lowest is at most 0."""
+        prescribed = self._prescribed(scene)
+        if not prescribed.size:
+            return np.zeros(3), np.zeros(3)
+        moved = prescribed - prescribed[0]
+        return moved.min(axis=(0, 1)), moved.max(axis=(0, 1))
+
     def _prescribed(self, scene: Scene) -> np.ndarray:
         return self.position[:, scene.prescribed].astype(np.float64)
 

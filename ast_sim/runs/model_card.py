@@ -81,7 +81,10 @@ def _ranges(scope: Scope) -> Iterator[tuple[str, float, float]]:
     yield "nodes", *scope.nodes
     yield f"size of the deforming bodies [{unit}]", *scope.size
     yield f"mesh spacing [{unit}]", *scope.spacing
+    yield "size of what is held, as a share of it", *scope.held
     yield f"travel of prescribed nodes [{unit}]", *scope.travel
+    for axis, *limits in zip("xyz", scope.motion_low, scope.motion_high, strict=True):
+        yield f"displacement of prescribed nodes along {axis} [{unit}]", *limits
     for name, limits in scope.material_ranges.items():
         yield f"{name} of the material", *limits
 

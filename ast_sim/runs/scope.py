@@ -28,7 +28,11 @@ class Scope:
         nodes: number of nodes of a scene.
         size: diagonal of the box around the deforming bodies at rest.
         spacing: mean length of the mesh edges of the deforming bodies at rest.
+        held: diagonal of the box around the held nodes (the prescribed ones of the deforming bodies) at rest, as a
+            share of `size`; 0 if nothing is held.
         travel: largest distance of a prescribed node from its place in the first frame.
+        motion_low, motion_high: the lowest and the highest displacement of a prescribed node from its place in the
+            first frame, along x, y and z; along an axis that training scenes were mirrored in, either way.
         increment: largest displacement of a prescribed node in one frame.
         usual_increment: the median of that displacement over all frames in which one moves; 0 if none ever does.
         material_low, material_high: the lowest and the highest number of each material column.
@@ -42,9 +46,12 @@ class Scope:
     nodes: tuple[float, float]
     size: tuple[float, float]
     spacing: tuple[float, float]
+    held: tuple[float, float]
     travel: tuple[float, float]
     increment: tuple[float, float]
     usual_increment: float
+    motion_low: tuple[float, ...]
+    motion_high: tuple[float, ...]
     material_low: tuple[float, ...]
     material_high: tuple[float, ...]
     data: DataFacts
@@ -64,6 +71,7 @@ class Scope:
             (self.nodes, scene.num_nodes, "the scene has {} nodes", ""),
             (self.size, size_of(scene), "the deforming bodies measure {} across", length),
             (self.spacing, spacing_of(scene), "the mesh edges have a mean length of {}", length),
+            (self.held, held_share_of(scene), "the held nodes span {} of the size of the deforming bodies", ""),
             ((0.0, self.travel[1]), motion.travel(scene), "prescribed nodes move up to {} from their start", length),
             ((0.0, self.increment[1]), increment, "prescribed nodes move {} in one frame", length),
             *self._materials(scene),
@@ -71,6 +79,21 @@ class Scope:
             if not low - LEEWAY * abs(low) <= value <= high + LEEWAY * abs(high):
                 shown, *limits = (f"{number:.4g}{unit}" for number in (value, *dict.fromkeys((low, high))))
                 yield f"{text.format(shown)}; in training {' to '.join(limits)}"
+        yield from self._directions(scene, motion)
+
+    def _directions(self, scene: Scene, motion: Motion) -> Iterator[str]:
+        """One sentence for each axis along which prescribed nodes move farther than in training, where their travel
+        alone does not tell it."""
+        leeway = LEEWAY * self.travel[1]
+        if motion.travel(scene) > self.travel[1] + leeway:
+            return
+        for axis, low, high, *reached in zip(
+            "xyz", self.motion_low, self.motion_high, *motion.extent(scene), strict=True
+        ):
+            for value in reached:
+                if not low - leeway <= value <= high + leeway:
+                    shown, *limits = (f"{number:.4g} {self.length_unit}" for number in (value, low, high))
+                    yield f"prescribed nodes move {shown} along {axis}; in training {' to '.join(limits)}"
 
     def _materials(self, scene: Scene) -> Iterator[tuple[tuple[float, float], float, str, str]]:
         """The smallest and the largest number in each material column of the deforming bodies."""
@@ -84,8 +107,17 @@ class Scope:
 
 def size_of(scene: Scene) -> float:
     """The diagonal of the box around the deforming bodies at rest; 0 if there are none."""
-    points = scene.rest_position[scene.deforming_nodes].T.astype(np.float64, order="C")  # rows are reduced faster
+    return _diagonal(scene, scene.deforming_nodes)
+
+
+def _diagonal(scene: Scene, nodes: np.ndarray) -> float:
+    points = scene.rest_position[nodes].T.astype(np.float64, order="C")  # rows are reduced faster
     return float(np.linalg.norm(np.ptp(points, axis=1))) if points.size else 0.0
+
+
+def held_share_of(scene: Scene) -> float:
+    """The diagonal of the box around the held nodes at rest, as a share of `size_of`; 0 if there are none."""
+    return _diagonal(scene, scene.deforming_nodes & scene.prescribed) / (size_of(scene) or 1.0)
 
 
 def spacing_of(scene: Scene) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from ast_sim.inference.evaluation.measures import SquaredError, rmse_pooled
 from ast_sim.models.data_facts import DataFacts
 from ast_sim.models.model_config import ModelConfig
 from ast_sim.prescribed_motion import Motion
-from ast_sim.runs.scope import Scope, edge_lengths, size_of, spacing_of
+from ast_sim.runs.scope import Scope, edge_lengths, held_share_of, size_of, spacing_of
 from ast_sim.scene import AttributeValue, NodeType
 from ast_sim.support.errors import TrainingError
 
@@ -87,18 +87,23 @@ def _alike(constants: list[dict[str, AttributeValue | None]]) -> dict[str, float
     return {key: float(np.max(known.get(key, 0.0), initial=0.0)) for key in first}
 
 
-def scope_of(dataset: Dataset, data: DataFacts) -> Scope:
-    """The ranges of the training split, measured on the same trajectories, and what the model knows of its data."""
-    rows, materials, increments = [], [], []
+def scope_of(dataset: Dataset, data: DataFacts, mirror: Sequence[str] = ()) -> Scope:
+    """The ranges of the training split, measured on the same trajectories, and what the model knows of its data;
+    `mirror` names the axes along which the training mirrors scenes."""
+    rows, materials, increments, extents = [], [], [], []
     for _, trajectory in dataset.spread("train", MEASURED):
         scene = trajectory.scene
         motion = Motion(trajectory.position)
         moves = motion.increments(scene)
         increments += [length for length in moves if length > 0]
-        rows.append((scene.num_nodes, size_of(scene), spacing_of(scene), motion.travel(scene), max(moves)))
+        sizes = (scene.num_nodes, size_of(scene), spacing_of(scene), held_share_of(scene))
+        rows.append((*sizes, motion.travel(scene), max(moves)))
+        extents.append(motion.extent(scene))
         if scene.material is not None:
             materials.append(scene.material[scene.deforming_elements])
-    by_name = dict(zip(("nodes", "size", "spacing", "travel", "increment"), zip(*rows, strict=True), strict=True))
+    names = ("nodes", "size", "spacing", "held", "travel", "increment")
+    by_name = dict(zip(names, zip(*rows, strict=True), strict=True))
+    low, high = _widest(extents, mirror)
     material = np.concatenate(materials) if materials else np.zeros((1, 0))
     info = dataset.info
     return Scope(
@@ -108,10 +113,21 @@ def scope_of(dataset: Dataset, data: DataFacts) -> Scope:
         corners=dataset.element_size,
         **{key: (float(min(values)), float(max(values))) for key, values in by_name.items()},
         usual_increment=float(np.median(increments or [0.0])),
+        motion_low=tuple(low.tolist()),
+        motion_high=tuple(high.tolist()),
         material_low=tuple(material.min(axis=0).tolist()),
         material_high=tuple(material.max(axis=0).tolist()),
         data=data,
     )
+
+
+def _widest(extents: Sequence[tuple[np.ndarray, np.ndarray]], mirror: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+    """[3] and [3]: the lowest and the highest displacement of all scenes; along the axes `mirror`, either way."""
+    low = np.min([lowest for lowest, _ in extents], axis=0)
+    high = np.max([highest for _, highest in extents], axis=0)
+    mirrored = np.isin(["x", "y", "z"], list(mirror))
+    farthest = np.maximum(-low, high)
+    return np.where(mirrored, -farthest, low), np.where(mirrored, farthest, high)
 
 
 def largest_error(scales: DataScales, model: ModelConfig) -> float:

@@ -166,7 +166,7 @@ def start_training(
                 _require_same(folder, saved, resolved, source)
             elif processes.leads:
                 start = None if source is None else source.start()
-                scope = scope_of(dataset, resolved.model.data)
+                scope = scope_of(dataset, resolved.model.data, resolved.train.mirror)
                 spec = dataset.info.generator.get("spec")
                 write_config(folder.path, resolved, scope, dataset.fingerprint(), start, spec)
             with begin(config=resolved, callback=callback) as training:
