@@ -20,6 +20,7 @@ from ast_sim.inference.effort import Effort
 from ast_sim.inference.evaluation import deepest_frames
 from ast_sim.inference.evaluation.evaluated_run import Evaluation
 from ast_sim.inference.example_run import example_run
+from ast_sim.number_arrays import percent
 from ast_sim.simulate.jobs.generate import generate
 from ast_sim.support.progress import duration
 from ast_sim.training.start import train
@@ -100,10 +101,10 @@ def _show_first(out: Path, plates: dict[str, Any]) -> None:
     network = run.predict(truth, frames=deepest, effort=Effort())
     answer = run.predict(truth, frames=deepest)
     picture.write(out / "first.png", truth, answer.trajectory, run.settings.model.name, run.info.length_unit)
-    errors = [100 * one.errors(truth)["displacement"] for one in (network, answer)]
+    errors = [percent(one.errors(truth)["displacement"]) for one in (network, answer)]
     print(
-        f"  error {errors[0]:.2g} % of the displacement by one call of the model in {1000 * network.seconds:.0f} ms,"
-        f" {errors[1]:.2g} % with Newton steps in {1000 * answer.seconds:.0f} ms: {out / 'first.png'}"
+        f"  error {errors[0]} of the displacement by one call of the model in {1000 * network.seconds:.0f} ms,"
+        f" {errors[1]} with Newton steps in {1000 * answer.seconds:.0f} ms: {out / 'first.png'}"
     )
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
+from decimal import Decimal
 from typing import Any
 
 import numpy as np
@@ -126,6 +128,12 @@ def ranges(numbers: Iterable[int]) -> str:
         else:
             runs.append([number])
     return ", ".join(f"{run[0]}" if len(run) == 1 else f"{run[0]} to {run[-1]}" for run in runs)
+
+
+def percent(share: float, digits: int = 2) -> str:
+    """A share as text, "1.2 %" or "100 %", never with an exponent."""
+    rounded = f"{100 * share:.{digits}g}"
+    return f"{Decimal(rounded):f} %" if math.isfinite(share) else f"{rounded} %"
 
 
 def point(x: Iterable[float]) -> str:

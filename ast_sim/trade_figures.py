@@ -15,6 +15,8 @@ from typing import Any, Self
 
 import numpy as np
 
+from ast_sim.number_arrays import percent
+
 TOLERANCES = (0.1, 0.05, 0.025, 0.01, 0.005, 0.002)
 WITHIN = 0.9
 RESAMPLES = 2000  # of the bootstrap over scenes
@@ -186,7 +188,7 @@ class TradeFigures:
             return ""
         scenes = f"{len(self.mesh_errors)} scene{'s' * (len(self.mesh_errors) > 1)}"
         return (
-            f"The mesh alone makes the {self.quantity} {100 * self.mesh_error:.2g} % wrong (median of {scenes}, against"
+            f"The mesh alone makes the {self.quantity} {percent(self.mesh_error)} wrong (median of {scenes}, against"
             " 8 times the nodes): an answer with a smaller error is no nearer to the truth"
         )
 

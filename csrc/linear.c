@@ -168,9 +168,9 @@ static ast_status linear_chunk_task(int64_t index, void *context) {
   const ast_linear *sizes = job->sizes;
   const dense_sum *sums = job->partials.sums;
   const int64_t first = index * job->chunks.rows, last = min64(sizes->M, first + job->chunks.rows);
-  float *dz = ast_scratch(DENSE_ROWS * (job->dz_row + job->x_row) * (int64_t)sizeof *dz),
-        *x = dz + DENSE_ROWS * job->dz_row;
+  float *dz = ast_scratch(DENSE_ROWS * (job->dz_row + job->x_row) * (int64_t)sizeof *dz);
   if (!dz) return AST_NO_MEMORY;
+  float *x = dz + DENSE_ROWS * job->dz_row;
   float *partials = dense_start_chunk(&job->partials, index, first >= last);
   for (int64_t i = first; i < last; i += job->chunks.step) {
     const int64_t rows = min64(job->chunks.step, last - i);

@@ -56,9 +56,11 @@ typedef struct {
 
 static bool message_new_tile(const message_weights *w, message_tile *t) {
   const int64_t size = MESSAGE_TILE * w->row;
-  float *memory = ast_scratch(3 * (size + w->row) * (int64_t)sizeof *memory), *columns = memory + 3 * size;
+  float *memory = ast_scratch(3 * (size + w->row) * (int64_t)sizeof *memory);
+  if (!memory) return false;
+  float *columns = memory + 3 * size;
   *t = (message_tile){memory, memory + size, memory + 2 * size, {columns, columns + w->row, columns + 2 * w->row}};
-  return memory != NULL;
+  return true;
 }
 
 /* One register tile of x: channels of panel p of the edges from m on. P + Q comes last: large values cost the product

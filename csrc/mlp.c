@@ -73,8 +73,8 @@ static ast_status mlp_task(int64_t index, void *context) {
   const ast_mlp *mlp = job->mlp;
   const int64_t first_row = dense_begin(mlp->M, job->tasks, index), last = dense_begin(mlp->M, job->tasks, index + 1);
   float *input = ast_scratch(DENSE_ROWS * (job->input_row + job->hidden_row + job->y_row) * (int64_t)sizeof *input);
-  float *block = input + DENSE_ROWS * job->input_row, *y = block + DENSE_ROWS * job->hidden_row;
   if (!input) return AST_NO_MEMORY;
+  float *block = input + DENSE_ROWS * job->input_row, *y = block + DENSE_ROWS * job->hidden_row;
   for (int64_t i = first_row; i < last; i += DENSE_ROWS) {
     const int64_t rows = min64(DENSE_ROWS, last - i), hidden_row = job->kept.hidden ? mlp->H : job->hidden_row;
     float *hidden = job->kept.hidden ? job->kept.hidden + i * mlp->H : block;

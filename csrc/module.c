@@ -19,29 +19,60 @@ static PyObject *call_kernel(PyObject *self, PyObject *const *objects, Py_ssize_
   return result;
 }
 
-/* A new array with the values of this one, which kernels trust from now on (frozen.h). Or the same object if there is
- * nothing to do: it is such a one already, has no values, or is nothing that a kernel reads as indices in place. */
-static PyObject *freeze_one(PyObject *object) {
+/* Whether this is something that a kernel reads as indices in place. */
+static bool take_indices(PyObject *object, view *v, argument *a) {
   static const parameter dense;
+  return view_of(object, v) && v->type == INTS && v->ndim >= 1 && v->ndim <= MAX_SHAPE && take_layout(&dense, v, a) &&
+         a->bytes;
+}
+
+/* A new array with these values, which kernels trust from now on (frozen.h). */
+static PyObject *frozen_copy(const view *v, const argument *a) {
+  frozen *f = new_frozen(a->bytes);
+  if (!f) return NULL;
+  memcpy(f->shown, a->data, (size_t)a->bytes);
+  return array_of(f, v->ndim, v->shape);
+}
+
+/* The same object if there is nothing to do: it is frozen already, or no indices. */
+static PyObject *freeze_one(PyObject *object) {
   view v;
   argument a;
-  if (!view_of(object, &v) || v.type != INTS || v.ndim < 1 || v.ndim > MAX_SHAPE || !take_layout(&dense, &v, &a) ||
-      !a.bytes || find_frozen(a.data, a.bytes))
-    return Py_INCREF(object), object;
-  frozen *f = new_frozen(a.bytes);
-  if (!f) return NULL;
-  memcpy(f->shown, a.data, (size_t)a.bytes);
-  return array_of(f, v.ndim, v.shape);
+  if (take_indices(object, &v, &a) && !find_frozen(a.data, a.bytes)) return frozen_copy(&v, &a);
+  return Py_INCREF(object), object;
+}
+
+/* The same object if it is not frozen, or if what it shows is what kernels read. */
+static PyObject *read_one(PyObject *object) {
+  view v;
+  argument a;
+  if (!take_indices(object, &v, &a) || !find_frozen(a.data, a.bytes)) return Py_INCREF(object), object;
+  PyObject *values = NULL;
+  if (secure(&a)) {
+    if (memcmp(a.data, a.frozen->shown, (size_t)a.bytes)) values = frozen_copy(&v, &a);
+    else Py_INCREF(values = object);
+  }
+  Py_DECREF(a.frozen->owner);
+  return values;
+}
+
+static PyObject *of_each(PyObject *const *objects, Py_ssize_t num, PyObject *(*of)(PyObject *)) {
+  PyObject *tuple = PyTuple_New(num);
+  for (Py_ssize_t i = 0; tuple && i < num; i++) {
+    PyObject *object = of(objects[i]);
+    if (!object || PyTuple_SetItem(tuple, i, object)) Py_CLEAR(tuple);
+  }
+  return tuple;
 }
 
 static PyObject *freeze(PyObject *self, PyObject *const *objects, Py_ssize_t num) {
   (void)self;
-  PyObject *tuple = PyTuple_New(num);
-  for (Py_ssize_t i = 0; tuple && i < num; i++) {
-    PyObject *array = freeze_one(objects[i]);
-    if (!array || PyTuple_SetItem(tuple, i, array)) Py_CLEAR(tuple);
-  }
-  return tuple;
+  return of_each(objects, num, freeze_one);
+}
+
+static PyObject *values_read(PyObject *self, PyObject *const *objects, Py_ssize_t num) {
+  (void)self;
+  return of_each(objects, num, read_one);
 }
 
 static PyMethodDef kernel_methods[sizeof bindings / sizeof *bindings];
@@ -102,6 +133,8 @@ static PyMethodDef methods[] = {
      "declare(name, names, numbers): adds the kernel of this name, which takes what the numbers of its spec say."},
     {"freeze", (PyCFunction)(void (*)(void))freeze, METH_FASTCALL,
      "freeze(*indices): copies that kernels trust, or the arrays themselves if they are such."},
+    {"values_read", (PyCFunction)(void (*)(void))values_read, METH_FASTCALL,
+     "values_read(*objects): copies of what kernels read of frozen arrays that were written to since; else the same."},
     {"set_pool", set_pool, METH_VARARGS,
      "set_pool(parallel_for, num_threads): addresses of torch's thread pool, 0 for serial."},
     {"keep_memory", keep_memory, METH_NOARGS, "Let the C library keep freed blocks; whether it had an effect."},

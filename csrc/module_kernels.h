@@ -13,10 +13,11 @@
 #include "arguments.h"
 
 #define NAMES_OF(...) #__VA_ARGS__
-#define PARAMETERS(name, ...) \
-  typedef struct {            \
-    argument __VA_ARGS__;     \
-  } name##_arguments;         \
+#define PARAMETERS(name, ...)                                                                              \
+  typedef struct {                                                                                         \
+    argument __VA_ARGS__;                                                                                  \
+  } name##_arguments;                                                                                      \
+  _Static_assert(sizeof(name##_arguments) % sizeof(argument) == 0, "it is read as an array of arguments"); \
   UNUSED static const char name##_parameters[] = NAMES_OF(__VA_ARGS__)
 
 #define KERNEL(name, ...)                                                           \

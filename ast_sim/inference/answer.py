@@ -26,6 +26,7 @@ from ast_sim.mechanics.driven import Driven
 from ast_sim.mechanics.linearised_contact import STILL
 from ast_sim.mechanics.physics_check import Law, PhysicsCheck, check_physics
 from ast_sim.named_field import NamedField
+from ast_sim.number_arrays import percent
 from ast_sim.scene import AttributeValue, Scene, Trajectory
 from ast_sim.support.errors import AstSimError, MissingExtra, RolloutError
 from ast_sim.support.notebook_table import html_picture, html_table, one_line
@@ -125,15 +126,14 @@ class Answer:
     def _facts(self) -> dict[str, str]:
         unit = "" if self.info is None else f" {self.info.length_unit}"
         moved = np.linalg.norm(self.displacement[:, self.scene.deforming_nodes], axis=2)
-        converged = {None: "no Newton steps", True: "yes", False: "no"}[self.converged]
         return {
             "name": self.name,
             "frames": ", ".join(map(str, self.frames[:10])) + (", ..." if len(self.frames) > 10 else ""),
             "nodes": f"{self.scene.num_nodes:,}",
             "largest displacement": f"{moved.max(initial=0.0):.4g}{unit}",
             "largest stress": "none" if self.stress is None else f"{self.stress.max(initial=0.0):.4g} Pa",
-            "expected error": "not known" if self.expected_error is None else f"{100 * self.expected_error:.2g} %",
-            "converged": converged,
+            "expected error": "not known" if self.expected_error is None else percent(self.expected_error),
+            "converged": {None: "no Newton steps", True: "yes", False: "no"}[self.converged],
             **({} if (band := self.band()) is None else {f"band ({100 * LEVEL:g} %)": f"{band.max():.3g}{unit}"}),
             "seconds": f"{self.seconds:.3g}",
             **({} if self.failure is None else {"failure": self.failure}),

@@ -16,12 +16,11 @@ from ast_sim.prescribed_motion import Motion
 from ast_sim.runs.scope import Scope
 from ast_sim.scene import Scene
 from ast_sim.simulate.families.assembly import scene_of
-from ast_sim.simulate.jobs.recipe import whole
 from ast_sim.simulate.own_assembly.parameters import Values, completed, recorded
 from ast_sim.simulate.own_assembly.spec_reader import read_spec
 from ast_sim.simulate.own_assembly.standing import reference
 from ast_sim.support.errors import ConfigError
-from ast_sim.support.toml_settings import require_range
+from ast_sim.support.toml_settings import require_range, whole
 
 NOT_TRAINED = "the run was not trained on a specification, so it is not known how this one differs from its training"
 

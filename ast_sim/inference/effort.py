@@ -9,11 +9,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from numbers import Integral
 from statistics import fmean
 from typing import TYPE_CHECKING, Any, Self
 
 from ast_sim.support.errors import ConfigError
+from ast_sim.support.toml_settings import whole
 
 if TYPE_CHECKING:
     from ast_sim.models.model_config import ModelConfig
@@ -64,11 +64,7 @@ class Effort:
         return cls(newton_steps=STEPS_BEFORE_SOLVER, solved=True)
 
     def __post_init__(self) -> None:
-        for key, count in self._counts.items():
-            if not isinstance(count, Integral) or isinstance(count, bool):
-                raise ConfigError(f"{key} is {count!r}; it must be a whole number")
-            if count < 0:
-                raise ConfigError(f"{key} is {count}; it must be at least 0")
+        whole(0, **self._counts)
 
     @property
     def _counts(self) -> dict[str, int]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from numbers import Integral
 
 import numpy as np
 
@@ -16,6 +15,7 @@ from ast_sim.prescribed_motion import Motion, RigidMotion, Vector, frames_for
 from ast_sim.runs.scope import Scope, spacing_of
 from ast_sim.scene import Scene, Trajectory
 from ast_sim.support.errors import ConfigError, DatasetError
+from ast_sim.support.toml_settings import whole
 
 LEAST_RESOLVED = 0.01  # of a mean edge: rounding of the positions may be as large
 Motions = Motion | Mapping[int, RigidMotion | Vector] | np.ndarray
@@ -109,8 +109,7 @@ def _completed(
     """The motion of the prescribed nodes in every frame."""
     if motion is None or (isinstance(motion, Mapping) and not motion):
         raise ConfigError(f"{name}: say how its prescribed nodes move: {{BODY: (x, y, z)}} (--move BODY=X,Y,Z)")
-    if frames is not None and (isinstance(frames, bool) or not isinstance(frames, Integral)):
-        raise ConfigError(f"{name}: num_frames is {frames!r}; it must be a whole number")
+    (frames,) = whole(num_frames=frames)
     if isinstance(motion, Mapping):
         least = config.data.given_frames + 1
         if frames is None and not scope.usual_increment:

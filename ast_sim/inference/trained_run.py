@@ -26,6 +26,7 @@ from ast_sim.inference.predicting.question import Frames, Question
 from ast_sim.inference.promises.calibration import Calibration
 from ast_sim.inference.promises.chosen_effort import ErrorLimit, chosen_effort
 from ast_sim.inference.sweep import Sweep, sweep
+from ast_sim.number_arrays import percent
 from ast_sim.runs import run_file
 from ast_sim.scene import Scene, Trajectory
 from ast_sim.simulate.own_assembly.grid import grid, read_table
@@ -33,7 +34,7 @@ from ast_sim.support.errors import ConfigError, RolloutError
 from ast_sim.support.notebook_table import html_table, one_line
 from ast_sim.support.progress import Progress, ShowProgress
 from ast_sim.support.provenance import provenance
-from ast_sim.support.toml_settings import NOTHING, require_range
+from ast_sim.support.toml_settings import NOTHING, whole
 
 
 class Run:
@@ -77,7 +78,7 @@ class Run:
             "checkpoint": f"step {self.step:,}",
             "family": f"{self.scope.family}, lengths in {self.scope.length_unit}",
             "effort": self.effort.text,
-            "expected error": "not measured" if error is None else f"{100 * error:.2g} %",
+            "expected error": "not measured" if error is None else percent(error),
         }
 
     def __repr__(self) -> str:
@@ -336,7 +337,7 @@ class Run:
             made_from: the specification or the parts of your own of which the dataset was made; the solver needs them.
             progress: as in `generate`; it counts scenes, once for all frames, once for the deepest, once solved.
         """
-        require_range("solver_scenes", solver_scenes, 0)
+        (solver_scenes,) = whole(0, solver_scenes=solver_scenes)
         with self.open(data) as dataset:
             with Progress(2 * dataset.count(split) + solver_scenes, "scenes", progress) as bar:
                 figures = evaluate(self.model, dataset, split, bar.advance, self.effort, solver_scenes, made_from)

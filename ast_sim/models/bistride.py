@@ -30,7 +30,7 @@ from torch import Tensor
 
 from ast_sim.batches.graph import edge_vectors
 from ast_sim.batches.mirror_and_shift import Placement
-from ast_sim.ops import EdgeSet, join_indices, offsets_of, segment_sum
+from ast_sim.ops import EdgeSet, join_indices, offsets_of, segment_spread, segment_sum
 from ast_sim.ops.spec import segment_of
 
 NEAR_CENTRE = 1.2  # nodes up to this multiple of the least distance from the centroid may start the search
@@ -59,12 +59,12 @@ class Pooling:
 
     def pool(self, x: Tensor) -> Tensor:
         """[N, F] -> [C, F]: the weighted mean over the neighbours of each kept node."""
-        sent = spread(x, *self.edges.by_sender) * self.weight.to(x.dtype)
+        sent = segment_spread(x, *self.edges.by_sender) * self.weight.to(x.dtype)
         return segment_sum(sent, *self.edges.by_receiver)
 
     def unpool(self, x: Tensor) -> Tensor:
         """[C, F] -> [N, F], the transpose of `pool`: the weighted sum over the kept neighbours of each node."""
-        sent = spread(x, *self.edges.by_receiver) * self.weight.to(x.dtype)
+        sent = segment_spread(x, *self.edges.by_receiver) * self.weight.to(x.dtype)
         return segment_sum(sent, *self.edges.by_sender)
 
     def pool_contacts(self, contacts: EdgeSet) -> EdgeSet:
@@ -199,14 +199,6 @@ def _pooling(adjacency: csr_array, kept: np.ndarray, weight: np.ndarray, moves: 
     edges = _edge_set(neighbours)
     weights = share[neighbours.indices] / total.repeat(np.diff(neighbours.indptr))
     return Pooling(torch.from_numpy(kept), edges, torch.from_numpy(weights).float()[:, None], moves), total
-
-
-def spread(x: Tensor, order: Tensor, offsets: Tensor) -> Tensor:
-    """[N, F]: row c of x [C, F] at each place order[j], j in [offsets[c], offsets[c + 1]); transpose of `segment_sum`.
-
-    It equals an index_select by the segment of each row, but its gradient is summed in stored order.
-    """
-    return torch.ops.ast_sim.segment_spread(x, order, offsets, False)
 
 
 def subset(edges: EdgeSet, wanted: Tensor) -> EdgeSet:

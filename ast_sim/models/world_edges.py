@@ -26,7 +26,7 @@ def world_edges(batch: Batch, radius: float, most: int | None) -> EdgeSet:
     """
     graph = batch.graph
     offsets = graph.node_offsets.tolist()
-    position = batch.position.double().numpy()
+    position = batch.position.detach().double().numpy()
     # Mesh edges lie in both directions, sorted by receiver and sender.
     mesh = _keys(graph.m2m.receivers.numpy(), graph.m2m.senders.numpy(), len(position))
     near = [start + _pairs(position[start:end], radius) for start, end in zip(offsets[:-1], offsets[1:], strict=True)]

@@ -19,7 +19,7 @@ from ast_sim.ops._linear import linear
 from ast_sim.ops._message import message_edges, message_sum
 from ast_sim.ops._mlp import mlp
 from ast_sim.ops._octree import CellMap, Octree, octree
-from ast_sim.ops._segment import segment_mean, segment_sum
+from ast_sim.ops._segment import segment_mean, segment_spread, segment_sum
 from ast_sim.ops._sparse_conv import sparse_conv, sparse_conv_transposed
 
 __all__ = [
@@ -48,6 +48,7 @@ __all__ = [
     "proximity",
     "rotated",
     "segment_mean",
+    "segment_spread",
     "segment_sum",
     "self_attention",
     "sparse_conv",

@@ -110,7 +110,7 @@ class EdgeSet(IndexSet):
     @cached_property
     def by_receiver(self) -> tuple[Tensor, Tensor]:
         """The edges in stored order, and the offsets of each receiver's edges, as segment ops take them."""
-        return *frozen(torch.arange(len(self))), self.receiver_offsets
+        return *frozen(torch.arange(len(self), device=self.receivers.device)), self.receiver_offsets
 
     @cached_property
     def by_sender(self) -> tuple[Tensor, ...]:

@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ast_sim.ops.derivatives import gradient_op
-from ast_sim.ops.library import Kernel, Op
+from ast_sim.ops.library import Kernel, Op, is_at_most
 
 ACTIVATIONS = ("none", "relu", "geglu")
 RELU, GEGLU = 1, 2  # as numbers
@@ -81,7 +81,7 @@ def linear(
         raise ValueError(f"linear: activation {activation!r} is unknown: choose of {', '.join(ACTIVATIONS)}")
     save = False
     if activation == "geglu" or (activation == "relu" and residual is not None):
-        small = x.shape[0] * weight.shape[0] <= SAVED
+        small = is_at_most(x.shape[0] * weight.shape[0], SAVED)
         save = small and torch.is_grad_enabled() and any(y is not None and y.requires_grad for y in (x, weight, bias))
     op = _geglu if activation == "geglu" else _linear
     return op(x, weight, bias, residual, ACTIVATIONS.index(activation), save)[0]

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from ast_sim.ops.derivatives import gradient_op
-from ast_sim.ops.library import Kernel, Op
+from ast_sim.ops.library import Kernel, Op, is_at_most
 
 EPSILON = 1e-5
 SAVED = 1 << 25  # hidden units and outputs with more elements are not kept for the gradient, but computed again
@@ -95,6 +95,6 @@ def mlp(
         ValueError: shapes are not as above.
     """
     tensors = (x, beside, weight1, bias1, weight2, bias2, *(norm or (None, None)))
-    small = x.shape[0] * (weight1.shape[0] + weight2.shape[0]) <= SAVED
+    small = is_at_most(x.shape[0] * (weight1.shape[0] + weight2.shape[0]), SAVED)
     save = small and torch.is_grad_enabled() and any(y is not None and y.requires_grad for y in tensors)
     return _mlp(*tensors, residual, save)[0]

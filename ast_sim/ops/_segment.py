@@ -71,6 +71,15 @@ def segment_mean(x: Tensor, node_order: Tensor, node_offsets: Tensor) -> Tensor:
     return _sum(x, node_order, node_offsets, True)
 
 
+def segment_spread(x: Tensor, node_order: Tensor, node_offsets: Tensor) -> Tensor:
+    """[N, F]: row c of x [C, F] at each place node_order[j], j in [node_offsets[c], node_offsets[c+1]); the transpose
+    of `segment_sum`.
+
+    It equals an index_select by the segment of each row, but its gradient is summed in stored order.
+    """
+    return _spread(x, node_order, node_offsets, False)
+
+
 def column_sum(x: Tensor) -> Tensor:
     """[F]: the sum over the rows of x [N, F]. Its bits do not depend on the number of threads, unlike torch's sum."""
     return _column_sum(x)

@@ -16,6 +16,7 @@ import os
 import sys
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
+from torch.fx.experimental.proxy_tensor import disable_proxy_modes_tracing
 
 from ast_sim.ops.spec import Given, Parameter, Sizes, Spec, check
 
@@ -205,8 +207,12 @@ class Op:
         return self._outputs(*args)
 
     def reference(self, *args) -> Any:
-        """The composition, after the checks."""
-        self._check(*args)
+        """The composition, after the checks. Both read what kernels read, although torch traces or somebody has
+        written to frozen indices."""
+        watched = torch._C._len_torch_dispatch_stack() > 0
+        with disable_proxy_modes_tracing() if watched else nullcontext():
+            args = _values_read(args)
+            self._check(*args)
         result = self.composition(*args)
         return Kernel.given(result, args) if isinstance(result, tuple) else result
 
@@ -267,14 +273,32 @@ def _is_watched() -> bool:
     )
 
 
+def is_at_most(size: int, most: int) -> bool:
+    """Whether a size is no larger. While torch traces: whether no size that the graph will meet is."""
+    if not torch.compiler.is_compiling():
+        return size <= most
+    from torch.fx.experimental.symbolic_shapes import statically_known_true
+
+    return statically_known_true(size <= most)
+
+
 def frozen(*indices: Tensor) -> tuple[Tensor, ...]:
     """Copies of int64 tensors that the C core trusts: from the first call on it keeps the values, and checks them once.
 
-    So nobody should write to the copies: kernels would not see it. Other tensors are copied and checked in every call.
+    So nobody should write to the copies: no op would see it after the first. Other tensors are copied and checked in
+    every call.
     """
     if BACKEND == "torch" or torch.compiler.is_compiling() or torch._C._len_torch_dispatch_stack() > 0:
         return indices
     return tuple([x if y is x else torch.from_numpy(y) for x, y in zip(indices, _C.freeze(*indices), strict=True)])
+
+
+def _values_read(args: Sequence) -> Sequence:
+    """The arguments; for frozen indices that somebody has written to, what kernels read."""
+    if BACKEND == "torch" or torch.compiler.is_compiling() or torch._C._len_torch_dispatch_stack() > 0:
+        return args
+    values = _C.values_read(*args)
+    return [x if y is x else torch.from_numpy(y) for x, y in zip(args, values, strict=True)]
 
 
 class IndexSet:

@@ -37,7 +37,8 @@ class Dimension:
     @staticmethod
     def of(text: str) -> Dimension:
         terms = [_TERM.fullmatch(term.strip()) for term in text.split("+")]
-        parts = [(int(term[1] or 1), term[2]) for term in terms if term]
+        parts = [(int(term[1] or 1), term[2]) for term in terms if term and term[0]]
+        _require(len({letter for _, letter in parts}) == len(terms), f"{text!r} is no size such as 27, 4E or C+1")
         constant = sum(n for n, letter in parts if not letter)
         return Dimension(text.strip(), constant, {letter: n for n, letter in parts if letter})
 
@@ -135,13 +136,20 @@ def _inside(text: str) -> tuple[Dimension, list[str]]:
     return Dimension.of("0" if names else text or "0"), names
 
 
+def _require(right: object, what: str) -> None:
+    if not right:
+        raise ValueError(f"in a spec, {what}")
+
+
 def _parameters(text: str, output: bool = False) -> list[Parameter]:
     parameters = []
+    understood = "".join(match[0] for match in _PARAMETER.finditer(text))
+    _require(understood == text, f"only {understood!r} of {text!r} can be read")
     for name, optional, shape, words in _PARAMETER.findall(text):
         dimensions = tuple(map(Dimension.of, shape.split(","))) if shape else None
         known = dict(_WORD.findall(words))
-        if not known.keys() <= {*_WORDS, *CHECKS}:
-            raise ValueError(f"{name} in a spec has words that nobody knows: {words}")
+        _require(known.keys() <= {*_WORDS, *CHECKS}, f"{name} has words that nobody knows: {words}")
+        _require(dimensions or known.keys() & _SCHEMA.keys(), f"{name} has neither a shape nor a word for what it is")
         parameters.append(Parameter(name, bool(optional), output, dimensions, known))
     return parameters
 
@@ -208,7 +216,7 @@ class Spec:
         """The expression of whether an output is wanted."""
         conditions = []
         for name in p.names("if"):
-            other = next(x for x in self.inputs if x.name == name)
+            other = {x.name: x for x in self.inputs}[name]
             wants = other.names("wants")
             place = f"[{wants.index(p.name[1:])}]" if len(wants) > 1 else ""
             conditions.append(f"{name}{place}" + " is not None" * (other.shape is not None))
@@ -332,15 +340,9 @@ def _check_corners(kernel: str, name: str, offsets: Tensor, elements: Tensor, or
         raise ValueError(f"{kernel}: node_order must be the corners of the elements at each node, ascending")
 
 
-CHECKS: dict[str, Callable[..., None]] = {
-    "offsets": check_offsets,
-    "index": check_index,
-    "permutation": _check_permutation,
-    "rising": _check_rising,
-    "scenes": _check_scenes,
-    "segments": _check_segments,
-    "corners": _check_corners,
-}
+CHECKS: dict[str, Callable[..., None]] = {"offsets": check_offsets, "index": check_index, "rising": _check_rising}
+CHECKS |= {"permutation": _check_permutation, "scenes": _check_scenes, "segments": _check_segments}
+CHECKS |= {"corners": _check_corners}
 
 
 def segment_of(offsets: Tensor) -> Tensor:

@@ -13,6 +13,7 @@ from typing import Any
 
 from ast_sim.batches.frame_pairs import target_counts
 from ast_sim.dataset.reader import Dataset
+from ast_sim.number_arrays import percent
 from ast_sim.planning.forecast import Forecast, forecast
 from ast_sim.planning.trials import GROWTH, LONGEST, MINUTES, Trial, Trials, candidates, round_sizes
 from ast_sim.runs.config_toml import write_settings
@@ -59,15 +60,15 @@ class Plan:
 
     def __str__(self) -> str:
         longest = self.trials[-2]
-        error, low, high = map(_percent, self.expected)
+        error, low, high = map(percent, self.expected)
         minutes, scenes = self.more_minutes, self.more_scenes
         return "\n".join([
             f"take: {longest.name}",
             f"{duration(60 * self.minutes)} are {self.steps:,} steps of {1000 * longest.seconds:.3g} ms; each frame is"
             f" seen {self.passes:.2g} times",
             f"expected error of one call of the network: {error} of the displacement ({low} to {high})",
-            f"in the trials, twice the steps leave {_percent(minutes)} of the error, twice the scenes"
-            f" {_percent(scenes)}: more {'minutes' if minutes < scenes else 'scenes'} help more",
+            f"in the trials, twice the steps leave {percent(minutes)} of the error, twice the scenes"
+            f" {percent(scenes)}: more {'minutes' if minutes < scenes else 'scenes'} help more",
             self.command,
         ])  # fmt: skip
 
@@ -194,10 +195,6 @@ def _counted(config: RunConfig) -> tuple[int, int, int]:
 
 
 def _tell(trial: Trial, bar: Progress) -> None:
-    text = f"{trial.name}: {trial.steps:,} steps, {trial.scenes:,} scenes, error {_percent(trial.error)}"
+    text = f"{trial.name}: {trial.steps:,} steps, {trial.scenes:,} scenes, error {percent(trial.error)}"
     bar.line(text)
     bar.advance(text)
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:.2g} %"

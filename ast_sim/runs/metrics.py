@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ast_sim.support.disk import write_text
+from ast_sim.support.errors import CheckpointError
 from ast_sim.support.sealed_line import seal, unseal
 
 METRICS = "metrics.jsonl"
@@ -23,9 +24,15 @@ class Metrics:
         self.path = run / METRICS
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
-        """The intact lines, in order. At the end, one warning counts the damaged ones; a kill may leave one."""
+        """The intact lines, in order. At the end, one warning counts the damaged ones; a kill may leave one.
+
+        Raises:
+            CheckpointError: it is a folder.
+        """
         if not self.path.exists():
             return
+        if self.path.is_dir():
+            raise CheckpointError(f"{self.path} is a folder: remove it; only the curves of the training are lost")
         damaged: list[str] = []
         number = 0
         with open(self.path, encoding="utf-8", errors="replace") as file:

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 import ast_sim
+from ast_sim.number_arrays import percent
 from ast_sim.runs.folder import Chosen
 from ast_sim.runs.scope import Scope
 from ast_sim.runs.train_config import RunConfig
@@ -106,5 +107,5 @@ def _errors(answers: Mapping[str, Any]) -> str:
     for one in measured:
         mark = " *" if one["effort"] == answers.get("effort") else ""
         numbers = " | ".join(str(one["effort"].get(dial, "")) for dial in dials)
-        lines.append(f"| {numbers}{mark} | {100 * one['error']:.3g} % |")
+        lines.append(f"| {numbers}{mark} | {percent(one['error'], 3)} |")
     return "\n".join(lines)

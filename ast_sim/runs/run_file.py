@@ -34,7 +34,7 @@ from ast_sim.runs.model_card import card
 from ast_sim.runs.scope import Scope
 from ast_sim.runs.train_config import RunConfig
 from ast_sim.support.disk import replacing
-from ast_sim.support.errors import CheckpointError
+from ast_sim.support.errors import CheckpointError, ConfigError
 from ast_sim.support.sealed_line import seal, unseal
 from ast_sim.support.toml_settings import from_values, to_values
 
@@ -142,9 +142,12 @@ def write(path: Path, run: RunFolder, model: Simulator, licence: str | None = No
 
     Raises:
         CheckpointError: the name does not end in `.ast`, or the file cannot be written.
+        ConfigError: the licence is no text.
     """
     if path.suffix != SUFFIX:
         raise CheckpointError(f"{path}: the name of a run file must end in {SUFFIX}")
+    if licence is not None and not isinstance(licence, str):
+        raise ConfigError(f"licence is {licence!r}; it must be the text of a licence")
     settings, chosen = run.settings, run.chosen
     without_path = dataclasses.replace(settings, data=Path(settings.data).name)
     facts = {

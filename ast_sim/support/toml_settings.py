@@ -79,6 +79,23 @@ def from_values(cls: type[T], values: Mapping[str, Any]) -> T:
     return _with(cls, values, dict(leaves(values)))
 
 
+def whole(least: int | None = None, /, **numbers: Any) -> list[Any]:
+    """The numbers as plain integers, whatever integer types they have; None stays None.
+
+    Raises:
+        ConfigError: one is no whole number, or below `least`; the text names it.
+    """
+    for name, value in numbers.items():
+        if value is None:
+            continue
+        if isinstance(value, bool) or not isinstance(value, Integral):
+            raise ConfigError(f"{name} is {value!r}; it must be a whole number")
+        numbers[name] = int(value)
+        if least is not None:
+            require_range(name, numbers[name], least)
+    return list(numbers.values())
+
+
 def require_range(key: str, value: float | None, least: float, most: float = LARGEST) -> None:
     """Raise ConfigError if the value is set, and is no number, below `least` or above `most`."""
     if value is not None and (isinstance(value, bool) or not isinstance(value, Real)):

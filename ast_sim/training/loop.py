@@ -23,6 +23,7 @@ from ast_sim.dataset.reader import Dataset
 from ast_sim.models.node_inputs import with_proximity
 from ast_sim.models.registry import build_model
 from ast_sim.models.simulator import Simulator
+from ast_sim.number_arrays import percent
 from ast_sim.runs import checkpoint
 from ast_sim.runs.folder import RunFolder
 from ast_sim.runs.train_config import RunConfig, TrainConfig
@@ -296,8 +297,8 @@ class Training:
         if known is not None and unknown is not None and unknown > APART * known:
             self.told = True
             self.progress.line(
-                f"each pair of frames was seen {passes:.0f} times. The error is {100 * known:.2g} % of the displacement"
-                f" on training scenes, {100 * unknown:.2g} % on validation scenes: more scenes help more than more"
+                f"each pair of frames was seen {passes:.0f} times. The error is {percent(known)} of the displacement"
+                f" on training scenes, {percent(unknown)} on validation scenes: more scenes help more than more"
                 " steps"
             )
 

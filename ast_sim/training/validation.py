@@ -23,6 +23,7 @@ from ast_sim.inference.predicting.jump import answer_steps
 from ast_sim.inference.predicting.question import Question
 from ast_sim.inference.predicting.rollout import rollouts
 from ast_sim.models.simulator import Simulator
+from ast_sim.number_arrays import percent
 from ast_sim.scene import Trajectory
 from ast_sim.support.progress import ShowProgress
 
@@ -162,7 +163,7 @@ def verdict(validated: list[Validated], best: float, unit: str) -> Verdict:
     text = f"network alone: error {error:.3g} {unit}{share}{after}{', the best so far' if error < best else ''}"
     reached = next((one.error for one in by_effort if one.effort == effort), None)
     if reached is not None:
-        text += f"; answers at the deepest frame: error {100 * reached:.3g} % of the displacement after {effort.text}"
+        text += f"; answers at the deepest frame: error {percent(reached, 3)} of the displacement after {effort.text}"
     record: dict[str, Any] = {"valid_rmse": error, "valid_hold_still": hold}
     if len(by_calls) > 1:
         record["valid_by_calls"] = by_calls

@@ -7,6 +7,7 @@ import os
 from collections.abc import Sequence
 from typing import Any
 
+from ast_sim.number_arrays import percent
 from ast_sim.support.progress import duration
 from ast_sim.trade_figures import WITHIN, Setting, TradeFigures, front
 from ast_sim.view import page
@@ -59,7 +60,7 @@ def _settings(figures: Sequence[TradeFigures]) -> dict[str, Any]:
         for same in sorted(zip(*of_quantities, strict=True), key=lambda same: same[0].middle):
             kept = [setting.kept for setting in same]
             if any(map(math.isfinite, kept)):
-                errors = [f"{100 * error:.3g} %" if math.isfinite(error) else "–" for error in kept]
+                errors = [percent(error, 3) if math.isfinite(error) else "–" for error in kept]
                 time = f"{1000 * same[0].middle:.3g} ms"
                 rows.append([side, same[0].name, *errors, time, same[0].command or "–"])
     return {"columns": columns, "rows": rows}

@@ -196,9 +196,9 @@ def test_wrong_questions(trained, tmp_path):
         (lambda: run.sweep(spec, {"travel": 2}, table=[{"travel": 1}]), "a table has the values of all parameters"),
         (lambda: run.predict(spec=spec, num_frames=0), "num_frames is 0; it must be at least 2"),
         (lambda: run.predict(spec=spec, num_frames=1), "num_frames is 1; it must be at least 2"),
-        (lambda: run.predict(spec=spec, num_frames=3.0), "num_frames is 3.0; must be a whole number"),
+        (lambda: run.predict(spec=spec, num_frames=3.0), "num_frames is 3.0; it must be a whole number"),
         (lambda: run.predict(spec=spec, nodes=-5), "nodes is -5; it must be at least 1"),
-        (lambda: run.sweep(spec, {"travel": 2}, nodes="5"), "nodes is '5'; must be a whole number"),
+        (lambda: run.sweep(spec, {"travel": 2}, nodes="5"), "nodes is '5'; it must be a whole number"),
         (lambda: run.sweep(spec, table=[]), "a sweep needs at least one row of values"),
         (
             lambda: run.predict(spec=write_assembly(metres, SPEC.replace('"mm"', '"m"'))),

@@ -1,5 +1,6 @@
 """The deepest frame: relative errors, stress, times, and the solver's variants for the same frame."""
 
+import itertools
 import json
 from dataclasses import asdict, replace
 
@@ -168,6 +169,12 @@ def test_friction_knows_the_frame_before_if_that_is_wanted_too(pressed, monkeypa
         stuck_at.clear()
         answers(model, [Question.of(truth, "plate", frames)], Effort(1, 2))
         assert [stuck is not None for stuck in stuck_at.values()] == known
+    # Frames in different domains are predicted apart, but in which domain does not matter to friction.
+    numbers = itertools.cycle(range(2))
+    monkeypatch.setattr(model, "domain", lambda position: next(numbers))
+    stuck_at.clear()
+    answers(model, [Question.of(truth, "plate", None)], Effort(1, 2))
+    assert len(stuck_at) == last and all(stuck is not None for stuck in stuck_at.values())
 
 
 def test_newton_steps_need_a_material(one, pressed):

@@ -58,8 +58,9 @@ def test_scenes_that_are_predicted_together_count_frames(trained, capfd):
     run.predict_motions(*scenes[0][:1], (one.position for one in truths[:1] * 3), frames=[-1], progress=told)
     assert told[-1][:2] == (3, 3)
     assert len(run.predict_scenes(iter(scenes), progress=False)) == len(scenes)
-    with pytest.raises(ConfigError, match="solver_scenes is -1; it must be at least 0"):
-        run.evaluate(data, solver_scenes=-1)
+    for scenes, must in ((-1, "at least 0"), (1.5, "a whole number")):
+        with pytest.raises(ConfigError, match=f"solver_scenes is {scenes}; it must be {must}"):
+            run.evaluate(data, solver_scenes=scenes)
     assert capfd.readouterr() == ("", "")
 
 

@@ -59,8 +59,8 @@ def test_another_program_is_represented_by_its_seconds(plates):
     for seconds in (-1, "95"):
         with pytest.raises(ConfigError, match=f"seconds are {seconds!r}; they must be a number above 0"):
             ast_sim.trade(ast_sim.example_run("plates"), plates, solver_seconds=seconds)
-    for scenes in (0, -1, 2.5, "3"):
-        with pytest.raises(ConfigError, match=f"scenes is {scenes!r}; it must be a whole number above 0"):
+    for scenes, must in ((0, "at least 1"), (-1, "at least 1"), (2.5, "a whole number"), ("3", "a whole number")):
+        with pytest.raises(ConfigError, match=f"scenes is {scenes!r}; it must be {must}"):
             ast_sim.trade(ast_sim.example_run("plates"), plates, scenes=scenes)
 
 

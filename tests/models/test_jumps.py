@@ -122,7 +122,7 @@ def test_only_the_wanted_frames_are_computed(monkeypatch):
     for same in (slice(-2, None), np.array([5, 6]), range(5, 7)):
         assert Question.of(truth, "scene", same).frames == (5, 6)
     assert Question.of(truth, "scene", -1).frames == (6,)
-    for wrong in ([1.5], "last", [True], [[1, 2]]):
+    for wrong in ([1.5], "last", [True], [[1, 2]], slice(1, None, 2.5), slice(None, None, 0)):
         with pytest.raises(ConfigError, match="frames must be whole numbers, one such number, or a slice, not"):
             Question.of(truth, "scene", wrong)
     with pytest.raises(ConfigError, match="scene: frame 6 is asked for twice: name each frame once"):

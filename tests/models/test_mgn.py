@@ -77,6 +77,22 @@ def test_both_edge_sets_count_and_have_weights_of_their_own():
         assert float((changed(batch).motion - before).detach().abs().max()) > 1e-3, part
 
 
+def test_it_is_differentiated_by_positions():
+    """The search for near nodes is not, but the lengths of the edges are that it finds."""
+    model, batch = made(resolved(SMALL), 0)
+    weights = torch.randn(batch.position.shape, generator=torch.Generator().manual_seed(1))
+
+    def value(position: torch.Tensor) -> torch.Tensor:
+        return (model(replace(batch, position=position)).motion * weights).sum()
+
+    position = batch.position.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(value(position), position)
+    step = 1e-4 * gradient / gradient.norm()
+    with torch.no_grad():
+        change = value(position + step) - value(position - step)
+    assert float(change) == pytest.approx(2e-4 * float(gradient.norm()), rel=0.02)
+
+
 def test_a_scene_alone_equals_a_scene_in_a_batch():
     model, both = made(resolved(SMALL), 0, 1)
     alone = torch.cat([model(batch_of(model, seed)).motion for seed in (0, 1)])

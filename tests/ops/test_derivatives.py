@@ -389,3 +389,14 @@ def test_proximity_refuses_derivatives():
         proximity_of(forward_ad.make_dual(x, x))
     with error:
         torch.func.vmap(proximity_of)(x[None])
+
+
+@pytest.mark.filterwarnings("ignore")  # torch's own
+@every_op
+def test_linearized(name, monkeypatch):
+    """`linearize` traces a tangent once, and gives the tangent in every direction. No value is read of what it
+    traces."""
+    wanted = exact(monkeypatch, lambda function, x, d: torch.func.jvp(function, x, d)[1], name)
+    function, inputs, directions = case(name)
+    _, tangent = torch.func.linearize(function, *inputs)
+    assert_right(tangent(*directions), wanted)

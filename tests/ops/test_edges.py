@@ -26,6 +26,15 @@ def test_several_sets_as_one_have_shifted_indices():
     assert EdgeSet.concatenate([one]) is one
 
 
+def test_the_orders_lie_where_the_edges_lie():
+    edges = EdgeSet.from_pairs(torch.tensor([0, 2, 1]), torch.tensor([1, 0, 1]), 3, 2)
+    there = EdgeSet(*(x.to("meta") for x in (edges.senders, edges.receivers, edges.receiver_offsets)), 3)
+    assert [x.device.type for x in there.by_receiver] == ["meta", "meta"]
+    with torch.device("meta"):
+        assert [x.device.type for x in edges.by_receiver] == ["cpu", "cpu"]
+    assert edges.by_receiver[0].tolist() == [0, 1, 2]
+
+
 def test_no_edges_and_wrong_indices():
     empty = torch.empty(0, dtype=torch.int64)
     edges = EdgeSet.from_pairs(empty, empty, 3, 2)

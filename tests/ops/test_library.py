@@ -10,6 +10,7 @@ from torch.fx.experimental.proxy_tensor import make_fx
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from ast_sim.ops import _segment as segment
+from ast_sim.ops import linear, mlp
 
 ORDER, OFFSETS = torch.tensor([2, 0, 1]), torch.tensor([0, 2, 3])
 
@@ -70,6 +71,29 @@ def test_modes_and_tracers_see_the_op():
     assert seen.names == ["ast_sim.segment_sum.default"]
     traced = make_fx(lambda x: segment.segment_sum(x, ORDER, OFFSETS))(x)
     assert torch.ops.ast_sim.segment_sum.default in [node.target for node in traced.graph.nodes]
+
+
+class Layers(torch.nn.Module):
+    """One op of those that keep the inputs of few rows, and of many rows compute them again."""
+
+    def __init__(self, op: str) -> None:
+        super().__init__()
+        self.op, self.weight = op, torch.nn.Parameter(torch.arange(24.0).view(4, 6) - 12)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        if self.op == "mlp":
+            return mlp(x, self.weight, None, self.weight.T[:, :4], None)
+        return linear(x, self.weight, None, "geglu")
+
+
+@pytest.mark.parametrize("strict", [False, True])
+@pytest.mark.parametrize("op", ["linear", "mlp"])
+def test_an_exported_graph_takes_any_number_of_rows(op, strict):
+    layers, few = Layers(op), torch.randn(7, 6)
+    shapes = ({0: torch.export.Dim("rows")},)
+    graph = torch.export.export(layers, (few,), dynamic_shapes=shapes, strict=strict).module()
+    for x in (few, torch.randn(17, 6)):
+        assert torch.equal(graph(x), layers(x))
 
 
 WITHOUT_SYMBOLS = "ctypes.CDLL = lambda path: object()"

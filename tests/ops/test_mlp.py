@@ -323,6 +323,18 @@ def test_other_dtypes_and_autocast():
     assert out.dtype == torch.float32
 
 
+@pytest.mark.parametrize("beside", [False, True])
+@pytest.mark.parametrize("shape", [shape for shape in SHAPES if shape[0] > 1])
+def test_half_precision_is_as_accurate_as_it_can_be(shape, beside):
+    """More inputs beside the others are no less accurate than the same inputs as columns of x."""
+    inputs, keep = chosen(case(*shape[:4], shape[4] if beside else 0), beside)
+    half = [x.half() for x in inputs]
+    x, *layers = (x.double() for x in half)
+    x = torch.cat([x, layers.pop(4)], dim=1) if beside else x
+    exact = composed([*keep[:5], False, *keep[6:]])(x, *layers)
+    assert float((fused(keep)(*half) - exact).abs().max()) <= 1e-3 * float(exact.abs().max())
+
+
 MEMORY = """
 import resource, torch
 from ast_sim.ops._mlp import mlp

@@ -60,6 +60,23 @@ def test_a_late_array_is_to_blame():
         check("op", Spec("dy[N], x[N]").inputs, {"dy": dy, "x": x})
 
 
-def test_unknown_words_are_refused():
-    with pytest.raises(ValueError, match="x in a spec has words that nobody knows: *dense"):
-        Spec("x[N] dense -> y[N]")
+@pytest.mark.parametrize(
+    "text, message",
+    [
+        ("x[N] dense -> y[N]", "x has words that nobody knows:  dense"),
+        ("x[m,I] -> y[I]", "'m' is no size"),
+        ("x[2*M,I] -> y[M]", r"'2\*M' is no size"),
+        ("x[M-1] -> y[M]", "'M-1' is no size"),
+        ("x[M,] -> y[M]", "'' is no size"),
+        ("x[M+] -> y[M]", r"'M\+' is no size"),
+        ("x[M+M] -> y[M]", r"'M\+M' is no size"),
+        ("x[M,I rows, weight[O,I] -> y[M]", "'I rows' is no size"),
+        ("x[N] index(O -> y[N]", r"only .* of 'x\[N\] index\(O"),
+        ("x[N] y[N] -> z[N]", r"only .* of 'x\[N\] y\[N\]"),
+        ("x[N] -> y[N]; z[N]", r"only .* of ' y\[N\]; z\[N\]"),
+        ("x[N], mean -> y[N]", "mean has neither a shape nor a word"),
+    ],
+)
+def test_what_is_no_spec_is_refused(text, message):
+    with pytest.raises(ValueError, match=message):
+        Spec(text).arguments(torch.zeros(1))

@@ -89,6 +89,24 @@ def test_what_was_checked_stays():
         segment_sum(x, order.clone(), offsets)
 
 
+def test_what_is_written_later_no_op_sees():
+    """Whether it is a kernel or a composition, and in the gradient likewise."""
+
+    def results(edges: EdgeSet, dtype: torch.dtype) -> list[torch.Tensor]:
+        x = torch.arange(12, dtype=dtype).view(4, 3).sin().requires_grad_()
+        b, W = torch.linspace(1, 2, 3, dtype=dtype), torch.eye(3, dtype=dtype)
+        out = message_sum(edges, x, x, None, None, W, b, b, b)
+        return [out.detach(), *torch.autograd.grad(out.square().sum(), x)]
+
+    for dtype in (torch.float32, torch.float64):
+        edges = EdgeSet.from_pairs(torch.tensor([0, 1, 2, 3, 1]), torch.tensor([1, 0, 3, 2, 2]), 4, 4)
+        before = results(edges, dtype)
+        edges.senders[1:] = 0
+        assert all(map(torch.equal, results(edges, dtype), before))
+        changed = EdgeSet(edges.senders.clone(), edges.receivers, edges.receiver_offsets, 4)
+        assert not torch.equal(results(changed, dtype)[0], before[0])
+
+
 def test_a_check_holds_only_for_what_was_checked():
     """The same array with another bound, or beside another array, is checked again."""
     x, order, offsets = case()

@@ -2,7 +2,10 @@
 
 import warnings
 
+import pytest
+
 from ast_sim.runs.metrics import Metrics
+from ast_sim.support.errors import CheckpointError
 
 
 def test_the_last_validation_of_a_step_counts(tmp_path):
@@ -29,3 +32,9 @@ def test_damaged_lines_give_one_warning_with_their_number(tmp_path):
     assert [str(one.message) for one in told] == [
         f"{metrics.path}: 3 of 6 lines are damaged and left out, the first is line 2: it is no sealed line of JSON"
     ]
+
+
+def test_a_folder_in_place_of_the_file_is_one_clear_error(tmp_path):
+    (tmp_path / "metrics.jsonl").mkdir()
+    with pytest.raises(CheckpointError, match=r"metrics.jsonl is a folder: remove it; only the curves"):
+        list(Metrics(tmp_path))

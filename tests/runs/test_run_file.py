@@ -172,6 +172,12 @@ def test_an_earlier_file_stays_if_the_disk_is_full(saved, tmp_path, monkeypatch)
     assert target.read_bytes() == file.read_bytes() and [path.name for path in tmp_path.iterdir()] == ["kept.ast"]
 
 
+def test_a_licence_is_a_text(saved, tmp_path):
+    with pytest.raises(ConfigError, match="licence is 5; it must be the text of a licence"):
+        saved[1].save(tmp_path / "run.ast", licence=5)
+    assert not (tmp_path / "run.ast").exists()
+
+
 def test_the_name_ends_in_ast(saved, tmp_path):
     with pytest.raises(CheckpointError, match=r"run.zip: the name of a run file must end in .ast"):
         saved[1].save(tmp_path / "run.zip")

@@ -19,6 +19,7 @@ from ast_sim.support.toml_settings import (
     require_range,
     settings,
     to_toml,
+    whole,
 )
 
 
@@ -243,3 +244,13 @@ def test_scalars_of_numpy_are_numbers():
 def test_what_is_no_number_lies_in_no_range(value):
     with pytest.raises(ConfigError, match=r"minutes is .*; it must be a number"):
         require_range("minutes", value, 1, 5)
+
+
+def test_whole_numbers_are_of_any_integer_type():
+    numbers = whole(0, frames=np.int32(5), nodes=None, seed=0)
+    assert numbers == [5, None, 0] and type(numbers[0]) is int
+    for value in (1.0, "1", True, np.float64(2), [1]):
+        with pytest.raises(ConfigError, match="frames is .*; it must be a whole number"):
+            whole(frames=value)
+    with pytest.raises(ConfigError, match="frames is 1; it must be at least 2"):
+        whole(2, frames=1)

@@ -13,7 +13,8 @@ from toy import one_thread  # noqa: F401 (used by being imported)
 
 from ast_sim.dataset.reader import Dataset
 from ast_sim.dataset.writer import DatasetWriter
-from ast_sim.inference.effort import Effort
+from ast_sim.inference.effort import Effort, EffortErrors
+from ast_sim.inference.evaluation.measures import SquaredError
 from ast_sim.inference.trained_run import Run
 from ast_sim.models.ast.ast_config import ASTConfig
 from ast_sim.models.data_facts import DataFacts
@@ -32,6 +33,7 @@ from ast_sim.training import loop, start
 from ast_sim.training.data_lengths import DataScales, measure, scope_of
 from ast_sim.training.defaults_from_data import resolve, resolve_training
 from ast_sim.training.rates import learning_rate, step_seed
+from ast_sim.training.validation import Validated, verdict
 
 DYNAMIC = DataFacts(integration="dynamic")
 SCALES = DataScales(displacement=0.01, increment=0.002, spacing=0.1, nodes=40, trajectories=3, pairs=100)
@@ -272,6 +274,18 @@ def test_validation_error_is_the_error_of_the_rollouts(linear, data, tmp_path):
             holds.append(math.sqrt((still**2).mean()))
     assert record["valid_rmse"] == pytest.approx(sum(roots) / 2, rel=1e-5)
     assert record["valid_hold_still"] == pytest.approx(sum(holds) / 2, rel=1e-9)
+
+
+def test_the_checkpoint_is_chosen_by_the_network_alone_and_the_effort_by_the_answers():
+    """Newton steps make all checkpoints alike: their errors must not choose."""
+    by_calls = [SquaredError(total, 4) for total in (4.0, 0.16, 0.16)]
+    efforts = [EffortErrors(Effort(0, n), error, None, n, 0.0) for n, error in ((0, 0.4), (10, 0.01))]
+    said = verdict([Validated(0, by_calls, SquaredError(16.0, 4), None, efforts)], math.inf, "m")
+    assert said.error == said.record["valid_rmse"] == pytest.approx(0.2) and said.effort == Effort(0, 10)
+    assert said.text == (
+        "network alone: error 0.2 m = 0.10 of the error of hold still after 1 correction, the best so far;"
+        " answers at the deepest frame: error 1 % of the displacement after 0 corrections, up to 10 Newton steps"
+    )
 
 
 def test_accumulated_gradients_are_the_mean_over_the_batches(linear, data, tmp_path):

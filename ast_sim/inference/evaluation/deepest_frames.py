@@ -24,6 +24,7 @@ from ast_sim.inference.predicting.question import Question
 from ast_sim.inference.quantities.relative_errors import relative_error, rms, stress_errors
 from ast_sim.mechanics.linearised_contact import STILL
 from ast_sim.models.simulator import Simulator
+from ast_sim.number_arrays import percent
 from ast_sim.scene import Trajectory
 from ast_sim.simulate.jobs.fastest_solver import UNMESHED, SolverOutcomes, cheapest, deepest_frame, solver_outcomes
 from ast_sim.support.errors import ConfigError, SimulationError
@@ -133,7 +134,7 @@ def lines(frames: DeepestFrames) -> list[str]:
         return ["the deepest frame: every prediction failed"]
     after = [f"{100 * error:.3g}" for error in frames.by_calls]
     told = [
-        f"the deepest frame at once: error {100 * frames.relative_error:.3g} % of the displacement,"
+        f"the deepest frame at once: error {percent(frames.relative_error, 3)} of the displacement,"
         f" {1000 * frames.seconds:.3g} ms in the median, on one thread"
     ]
     if len(after) > 1:
@@ -143,7 +144,7 @@ def lines(frames: DeepestFrames) -> list[str]:
     if frames.stress_share is not None and frames.largest_stress is not None:
         told.append(
             f"  stress: {frames.stress_share:.2f} of the error of the frame's true mean; the largest is"
-            f" {100 * frames.largest_stress:.3g} % off"
+            f" {percent(frames.largest_stress, 3)} off"
         )
     if frames.no_solver is not None:
         told.append(f"  the solver was not run: {frames.no_solver}")

@@ -32,6 +32,7 @@ from ast_sim.inference.predicting.question import Question
 from ast_sim.models.data_facts import DataFacts
 from ast_sim.models.simulator import Simulator
 from ast_sim.named_field import STRESS, Output, require_fields
+from ast_sim.number_arrays import percent
 from ast_sim.scene import Trajectory
 from ast_sim.support.errors import DatasetError
 
@@ -196,7 +197,7 @@ def table(figures: Figures) -> str:
             lines.append(f"  {predictor:18}" + "".join(f"{cell:>24}" for cell in shown))
         share = figures.relative(quantity) if quantity in figures.field_units else None
         if share is not None:
-            lines.append(f"  relative: {100 * share:.3g} % of the root mean square of {quantity} in all frames")
+            lines.append(f"  relative: {percent(share, 3)} of the root mean square of {quantity} in all frames")
         lines.append("")
     lines.append(f"scenes: {len(figures.scenes)}, failed: {figures.failures}, threads: {figures.threads}")
     if figures.jumps:

@@ -9,7 +9,7 @@ import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
-from numbers import Integral, Real
+from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -30,6 +30,7 @@ from ast_sim.support.disk import write_json
 from ast_sim.support.errors import ConfigError, SimulationError
 from ast_sim.support.progress import Progress, ShowProgress
 from ast_sim.support.provenance import provenance
+from ast_sim.support.toml_settings import whole
 from ast_sim.trade_figures import Setting, Side, TradeFigures
 from ast_sim.view import trade_page
 from ast_sim.view.files import make_folder
@@ -114,8 +115,7 @@ def trade(
             above 0; or a run beside has learned from another dataset or has the name of another run.
         DatasetError: the dataset cannot be read.
     """
-    if not isinstance(scenes, Integral) or isinstance(scenes, bool) or scenes < 1:
-        raise ConfigError(f"scenes is {scenes!r}; it must be a whole number above 0")
+    (scenes,) = whole(1, scenes=scenes)
     if solver_seconds is not None and not (isinstance(solver_seconds, Real) and 0 < solver_seconds < math.inf):
         raise ConfigError(f"the solver's seconds are {solver_seconds!r}; they must be a number above 0")
     runs = _by_name([run, *beside])

@@ -62,9 +62,7 @@ class Question:
         if frames is None:
             return self
         count = len(self.prescribed_position)
-        if isinstance(frames, slice):
-            frames = range(count)[frames]
-        numbers = _whole_numbers(frames)
+        numbers = _whole_numbers(frames, count)
         for number in numbers:
             if not -count <= number < count:
                 raise RolloutError(f"{self.name} has the frames 0 to {count - 1}; there is no frame {number}")
@@ -150,11 +148,17 @@ def fields_of(trajectory: Trajectory) -> dict[str, np.ndarray]:
     return {**{name: one.values for name, one in trajectory.fields.items()}, **stress}
 
 
-def _whole_numbers(frames: Iterable[int] | int) -> list[int]:
-    """The frames as a list; one number is a frame, too."""
+def _whole_numbers(frames: Frames, count: int) -> list[int]:
+    """The frames, of `count`, as a list; one number is a frame, too."""
+    wrong = f"frames must be whole numbers, one such number, or a slice, not {frames!r}"
+    if isinstance(frames, slice):
+        try:
+            return list(range(count)[frames])
+        except (TypeError, ValueError) as error:  # bounds that are no whole numbers, or a step of 0
+            raise ConfigError(wrong) from error
     listed = np.asarray(list(frames) if isinstance(frames, Iterable) else [frames])
     if listed.size and (listed.ndim != 1 or listed.dtype.kind not in "iu"):
-        raise ConfigError(f"frames must be whole numbers, one such number, or a slice, not {frames!r}")
+        raise ConfigError(wrong)
     return listed.tolist()
 
 

@@ -29,6 +29,7 @@ from ast_sim.inference.promises.familiarity import Familiarity
 from ast_sim.inference.promises.kept_errors import KEPT, KeptErrors
 from ast_sim.inference.quantities.band import LEVEL, Band, Comparison, compared
 from ast_sim.inference.quantities.relative_errors import moves
+from ast_sim.number_arrays import percent
 from ast_sim.runs.scope import LEEWAY, spacing_of
 from ast_sim.scene import Scene, Trajectory
 from ast_sim.simulate.jobs.fastest_solver import deepest_frame
@@ -83,7 +84,7 @@ class Calibration:
         told = ""
         for quantity in self.kept.errors:
             bounds = zip(self.kept.bounds(quantity), self.kept.efforts, strict=True)
-            known = [f"{100 * bound:.2g} % with {effort.text}" for bound, effort in bounds if math.isfinite(bound)]
+            known = [f"{percent(bound)} with {effort.text}" for bound, effort in bounds if math.isfinite(bound)]
             if known:
                 told += f"\n{quantity}: error at the deepest frame in {100 * KEPT:g} % of scenes: {'; '.join(known)}"
         return told

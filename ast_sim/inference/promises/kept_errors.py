@@ -18,6 +18,7 @@ from typing import Any, Self
 import numpy as np
 
 from ast_sim.inference.effort import Effort
+from ast_sim.number_arrays import percent
 from ast_sim.support.errors import ConfigError
 
 KEPT = 0.9  # of the scenes keep the error that was asked for
@@ -79,9 +80,9 @@ class KeptErrors:
         kept = np.flatnonzero(missed <= _allowed(above.shape[1]))
         if len(kept):
             return self.efforts[kept[0]]
-        smallest = [f"{quantity} {_percent(self.bounds(quantity)[-1])}" for quantity in wanted]
+        smallest = [f"{quantity} {percent(self.bounds(quantity)[-1], 3)}" for quantity in wanted]
         raise ConfigError(
-            f"no effort of this run keeps an error of {in_words(wanted)} in {_percent(KEPT)} of the scenes; the"
+            f"no effort of this run keeps an error of {in_words(wanted)} in {percent(KEPT)} of the scenes; the"
             f" smallest{' are, each alone,' if len(wanted) > 1 else ' is'} {', '.join(smallest)}, with"
             f" {self.efforts[-1].text}"
         )
@@ -108,13 +109,9 @@ class KeptErrors:
 
 def in_words(errors: Mapping[str, float]) -> str:
     """Errors by quantity, such as "2 % of the displacement and 5 % of the reaction"."""
-    return " and ".join(f"{_percent(error)} of the {quantity}" for quantity, error in errors.items())
+    return " and ".join(f"{percent(error, 3)} of the {quantity}" for quantity, error in errors.items())
 
 
 def _allowed(scenes: int) -> int:
     """How many of `scenes` calibration scenes may miss an effort; negative: there are too few scenes."""
     return math.floor((1 - KEPT) * (scenes + 1) + 1e-9) - 1
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:.3g} %"

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ast_sim.number_arrays import percent
 from ast_sim.scene import Trajectory
 from ast_sim.support.errors import ConfigError
 
@@ -78,8 +79,8 @@ def how_far(answer: Answer) -> list[str]:
         told.append(f"effort: {answer.source['effort']}, {answer.source['promise']}")
     told += [answer.source["solved"]] if "solved" in answer.source else []
     if answer.expected_error is not None:
-        percent = f"{100 * answer.expected_error:.2g} % of the displacement"
-        told.append(f"expected error: {percent}, as in the validation scenes at their deepest frame")
+        share = f"{percent(answer.expected_error)} of the displacement"
+        told.append(f"expected error: {share}, as in the validation scenes at their deepest frame")
     if (band := answer.band()) is not None:
         unit = "" if answer.info is None else f" {answer.info.length_unit}"
         widest = f"{band.max():.3g}{unit}, in frame {answer.frames[int(band.argmax())]}"

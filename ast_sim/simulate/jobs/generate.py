@@ -31,7 +31,7 @@ from ast_sim.simulate.families.known_families import family_module
 from ast_sim.simulate.jobs import cluster, pool
 from ast_sim.simulate.jobs.display import SceneProgress
 from ast_sim.simulate.jobs.manifest import Manifest, Watch
-from ast_sim.simulate.jobs.recipe import check_parts, checked_recipe, difference, recorded, whole
+from ast_sim.simulate.jobs.recipe import check_parts, checked_recipe, difference, recorded
 from ast_sim.simulate.jobs.samples import (
     Recipe,
     Sample,
@@ -45,6 +45,7 @@ from ast_sim.simulate.own_assembly.spec_reader import read_spec
 from ast_sim.support.disk import output_file, replacing
 from ast_sim.support.errors import ConfigError, SimulationError
 from ast_sim.support.progress import ShowProgress
+from ast_sim.support.toml_settings import whole
 
 MOST_SCENES = 1_000_000  # names of samples have six digits
 

@@ -21,6 +21,7 @@ from ast_sim.simulate.own_assembly.spec_reader import read_spec
 from ast_sim.simulate.own_assembly.standing import friction_is_drawn
 from ast_sim.simulate.own_assembly.yielding import material_columns
 from ast_sim.support.errors import ConfigError
+from ast_sim.support.toml_settings import whole
 
 if TYPE_CHECKING:
     from ast_sim.simulate.shapes.part_source import PartSource
@@ -131,20 +132,6 @@ def recipe_of(name: str, info: DatasetInfo, made_from: str | os.PathLike[str] | 
     if spec is not None and read_spec(spec).describe() != made["spec"]:
         raise ConfigError(f"{spec} or a file that it names differs from what {name} was made of")
     return recipe
-
-
-def whole(**numbers: Any) -> list[Any]:
-    """The numbers as plain integers, whatever integer types they have; None stays None.
-
-    Raises:
-        ConfigError: one is no whole number; the text names it.
-    """
-    for name, value in numbers.items():
-        try:
-            numbers[name] = None if value is None else index(value)
-        except TypeError as error:
-            raise ConfigError(f"{name} is {value!r}; must be a whole number") from error
-    return list(numbers.values())
 
 
 def _checked_keep(keep: Sequence[int], last: int) -> tuple[int, ...]:

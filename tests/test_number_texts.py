@@ -1,0 +1,25 @@
+"""Numbers as texts for people."""
+
+import math
+
+import pytest
+
+from ast_sim.number_arrays import percent
+
+
+@pytest.mark.parametrize(
+    ("share", "digits", "text"),
+    [
+        (0.996, 2, "100 %"),
+        (12.34, 2, "1200 %"),
+        (12345.0, 3, "1230000 %"),
+        (0.01234, 3, "1.23 %"),
+        (0.05, 2, "5 %"),
+        (1.5e-9, 2, "0.00000015 %"),
+        (0.0, 2, "0 %"),
+        (math.inf, 2, "inf %"),
+        (math.nan, 2, "nan %"),
+    ],
+)
+def test_a_share_in_percent_has_no_exponent(share, digits, text):
+    assert percent(share, digits) == text
