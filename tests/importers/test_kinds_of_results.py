@@ -1,10 +1,12 @@
 """Kinds of result files that once came in wrong or without a word: sets of nodes, parts in another order, moving
 geometry, results of some nodes only."""
 
+import meshio
 import numpy as np
 from blocks import block
 from scipy.io import netcdf_file
 
+from ast_sim.importers.mesh_file import read_mesh
 from ast_sim.importers.series import FieldNames, read_series
 from ast_sim.scene import NodeType
 
@@ -67,3 +69,17 @@ def test_sets_of_nodes_of_exodus_are_groups(tmp_path):
         assert (read.scene.rest_position[read.scene.node_type == NodeType.OBSTACLE][:, 2] == 2).all()
         assert (read.scene.node_type == NodeType.OBSTACLE).sum() == len(TOP)
         np.testing.assert_allclose(read.position[2, :, 2], 0.9 * read.scene.rest_position[:, 2], rtol=1e-6)
+
+
+def test_families_of_med_are_groups(tmp_path):
+    """A family may belong to several groups, and a group may have several families."""
+    tags = np.where(np.arange(len(PAD.elements)) < 6, -6, -7)
+    families = np.zeros(N, int)
+    families[LOW], families[TOP] = 2, 3
+    mesh = meshio.Mesh(PAD.rest_position, [("tetra", PAD.elements)], {"point_tags": families}, {"cell_tags": [tags]})
+    mesh.cell_tags = {-6: ["some", "all"], -7: ["all"]}
+    mesh.point_tags = {2: ["low"], 3: ["top"]}
+    mesh.write(tmp_path / "mesh.med")
+    groups = read_mesh(tmp_path / "mesh.med").groups
+    expected = {"low": LOW, "top": TOP, "some": np.unique(PAD.elements[:6]), "all": np.arange(N)}
+    assert {name: nodes.tolist() for name, nodes in groups.items()} == {k: v.tolist() for k, v in expected.items()}
