@@ -3,12 +3,15 @@ geometry, results of some nodes only."""
 
 import meshio
 import numpy as np
+import pytest
+import pyvista
 from blocks import block
 from scipy.io import netcdf_file
 
 from ast_sim.importers.mesh_file import read_mesh
 from ast_sim.importers.series import FieldNames, read_series
 from ast_sim.scene import NodeType
+from ast_sim.support.errors import DatasetError
 
 PAD = block(2, 2, 2)
 LOW = np.flatnonzero(PAD.rest_position[:, 2] == 0)
@@ -83,3 +86,117 @@ def test_families_of_med_are_groups(tmp_path):
     groups = read_mesh(tmp_path / "mesh.med").groups
     expected = {"low": LOW, "top": TOP, "some": np.unique(PAD.elements[:6]), "all": np.arange(N)}
     assert {name: nodes.tolist() for name, nodes in groups.items()} == {k: v.tolist() for k, v in expected.items()}
+
+
+def write_xdmf(path, orders, collections=1):
+    """A series in which each frame has points, which move, and cells of its own, in these orders."""
+    text = '<Xdmf Version="3.0"><Domain>'
+    for _ in range(collections):
+        text += '<Grid GridType="Collection" CollectionType="Temporal">'
+        for frame, order in enumerate(orders):
+            text += f'<Grid GridType="Uniform"><Time Value="{frame}.5"/><Topology TopologyType="Tetrahedron">'
+            text += item(PAD.elements[order], "Int") + '</Topology><Geometry GeometryType="XYZ">'
+            text += item(PAD.rest_position + pressed(frame)) + "</Geometry>"
+            for name, values in {"von_mises": 1000.0 * frame + np.arange(len(PAD.elements))[order]}.items():
+                text += f'<Attribute Name="{name}" Center="Cell">{item(values)}</Attribute>'
+            text += "</Grid>"
+        text += "</Grid>"
+    path.write_text(text + "</Domain></Xdmf>")
+
+
+def item(values, kind="Float"):
+    size = " ".join(map(str, np.shape(values)))
+    numbers = " ".join(map(str, np.ravel(values).tolist()))
+    return f'<DataItem Dimensions="{size}" NumberType="{kind}" Precision="8" Format="XML">{numbers}</DataItem>'
+
+
+def test_frames_of_xdmf_keep_points_and_cells_of_their_own(tmp_path):
+    plain = np.arange(len(PAD.elements))
+    write_xdmf(tmp_path / "all.xdmf", [plain, plain[::-1], plain])
+    read = read_series(tmp_path / "all.xdmf", FieldNames(handle="0:zmin,zmax"))
+    for frame in range(3):
+        np.testing.assert_allclose(read.position[frame], PAD.rest_position + pressed(frame), rtol=1e-6)
+        assert read.stress[frame, :, 0].tolist() == (1000 * frame + plain).tolist()
+    assert read.times == (0.5, 1.5, 2.5)
+
+
+def test_one_of_several_series_of_xdmf_is_not_taken_for_all(tmp_path):
+    write_xdmf(tmp_path / "all.xdmf", [np.arange(len(PAD.elements))], collections=2)
+    with pytest.raises(DatasetError, match="holds 2 series of frames, and one can be read"):
+        read_series(tmp_path / "all.xdmf", FieldNames())
+
+
+@pytest.mark.parametrize(("old", "new"), [('"Temporal"', '"Spatial"'), ('<Time Value="1.5"/>', "")])
+def test_a_series_of_xdmf_has_a_grid_and_a_time_for_each_frame(tmp_path, old, new):
+    path = tmp_path / "all.xdmf"
+    write_xdmf(path, 2 * [np.arange(len(PAD.elements))])
+    path.write_text(path.read_text().replace(old, new))
+    with pytest.raises(DatasetError, match="of the type 'Spatial'; must be 'Temporal'|entry 1 of the series is no"):
+        read_series(path, FieldNames())
+
+
+def test_times_that_do_not_ascend_are_told(tmp_path):
+    path = tmp_path / "all.xdmf"
+    write_xdmf(path, 3 * [np.arange(len(PAD.elements))])
+    path.write_text(path.read_text().replace('"1.5"', '"2.5"'))
+    read = read_series(path, FieldNames(handle="0:zmin,zmax"))
+    assert read.times is None and "the times of the frames do not ascend (0.5, 2.5, 2.5)" in read.attributes["notes"]
+
+
+def write_frame(path, position, **fields):
+    meshio.Mesh(position, [("tetra", CUBE.elements)], fields).write(path)
+
+
+CUBE = block(1, 1, 1)
+
+
+def test_parts_of_a_frame_stand_in_the_order_of_their_numbers(tmp_path):
+    """Two bodies of the same mesh would change their places where a PVD file lists them in another order."""
+    listed = []
+    for frame in range(3):
+        for part in (0, 1):
+            place = CUBE.rest_position + np.array((0, 0, 1.5 - 0.1 * frame)) * part
+            write_frame(tmp_path / f"f{frame}_{part}.vtu", place, tool=np.full(8, float(part)))
+            listed.append(f'<DataSet timestep="{frame}" part="{part}" file="f{frame}_{part}.vtu"/>')
+    listed[2:4] = listed[3], listed[2]
+    text = f'<VTKFile type="Collection"><Collection>{"".join(listed)}</Collection></VTKFile>'
+    (tmp_path / "all.pvd").write_text(text)
+    read = read_series(tmp_path / "all.pvd", FieldNames(obstacle="tool", handle="0:zmin"))
+    moved = read.position - read.position[0]
+    np.testing.assert_allclose(moved[1, 8:], np.tile((0, 0, -0.1), (8, 1)), atol=1e-6)
+    assert not moved[:, :8].any()
+    (tmp_path / "all.pvd").write_text(text.replace('"1" part="1"', '"1" part="2"'))
+    with pytest.raises(DatasetError, match="lists other parts for one time than for another"):
+        read_series(tmp_path / "all.pvd", FieldNames())
+
+
+@pytest.mark.parametrize("name", ["TimeValue", "TIME", "Time", "time"])
+def test_times_in_files_have_no_case(tmp_path, name):
+    for file, frame in (("a", 2), ("b", 0), ("c", 1)):
+        grid = pyvista.from_meshio(
+            meshio.Mesh(CUBE.rest_position * (1, 1, 1 - 0.1 * frame), [("tetra", CUBE.elements)])
+        )
+        grid.field_data[name] = [0.5 * frame]
+        grid.save(tmp_path / f"{file}.vtu")
+    read = read_series(tmp_path, FieldNames(handle="0:zmin"))
+    assert read.times == (0, 0.5, 1)
+    np.testing.assert_allclose(read.position[:, :, 2].max(axis=1), (1, 0.9, 0.8), rtol=1e-6)
+
+
+def test_a_stress_that_the_first_frame_lacks_is_not_passed_over(tmp_path):
+    for frame in range(3):
+        fields = {"von_mises": np.full(8, 1.0 * frame)} if frame else {}
+        write_frame(tmp_path / f"f{frame}.vtu", CUBE.rest_position * (1, 1, 1 - 0.1 * frame), **fields)
+    with pytest.raises(DatasetError, match=r"f1.vtu: holds 'von_mises', which the first frame lacks"):
+        read_series(tmp_path, FieldNames(handle="0:zmin"))
+
+
+@pytest.mark.parametrize("how", ['Endian="Big"', 'Seek="8"', 'Compression="Zlib"'])
+def test_binary_numbers_of_xdmf_that_meshio_would_misread_are_refused(tmp_path, monkeypatch, how):
+    monkeypatch.chdir(tmp_path)
+    meshio.Mesh(CUBE.rest_position, [("tetra", CUBE.elements)]).write("mesh.xdmf", data_format="Binary")
+    path = tmp_path / "mesh.xdmf"
+    assert len(read_mesh(path).points) == 8
+    path.write_text(path.read_text().replace('Format="Binary"', f'Format="Binary" {how}'))
+    with pytest.raises(DatasetError, match="binary numbers must be plain ones of this machine"):
+        read_mesh(path)

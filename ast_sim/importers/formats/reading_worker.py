@@ -253,10 +253,11 @@ def _time_of(data: Any) -> float | None:
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
     facts = data.GetFieldData()
-    for name in ("TimeValue", "TIME_VALUE", "TIME"):
-        array = facts.GetArray(name) if facts is not None else None
-        if array is not None and array.GetNumberOfValues() == 1:
-            return float(vtk_to_numpy(array).ravel()[0])
+    arrays = [facts.GetArray(index) for index in range(facts.GetNumberOfArrays())] if facts is not None else []
+    named = {(array.GetName() or "").lower(): array for array in arrays if array is not None}  # None: a text
+    for name in ("timevalue", "time_value", "time"):
+        if name in named and named[name].GetNumberOfValues() == 1:
+            return float(vtk_to_numpy(named[name]).ravel()[0])
     return None
 
 
