@@ -15,7 +15,8 @@ import numpy as np
 
 from ast_sim.importers.decks.deck_mesh import deck_mesh
 from ast_sim.importers.formats.gmsh_files import gmsh_mesh
-from ast_sim.importers.formats.source_mesh import SourceMesh, from_meshio
+from ast_sim.importers.formats.source_mesh import CellBlock, SourceMesh, from_meshio
+from ast_sim.importers.formats.stl_file import BadSurface, read_stl
 from ast_sim.importers.formats.vtk_files import ENDINGS, is_dyna, vtk_frames
 from ast_sim.support.errors import DatasetError
 
@@ -47,6 +48,8 @@ def frames_in(path: Path) -> Iterator[SourceMesh]:
         yield deck_mesh(path)
     elif ending == ".msh" and b"$MeshFormat" in _beginning(path):
         yield gmsh_mesh(path)
+    elif ending == ".stl":
+        yield _surface(path)
     elif ending in (".xdmf", ".xmf"):
         yield from _xdmf_frames(path)
     else:
@@ -56,6 +59,16 @@ def frames_in(path: Path) -> Iterator[SourceMesh]:
 def _beginning(path: Path) -> bytes:
     with path.open("rb") as file:
         return file.read(1 << 16)
+
+
+def _surface(path: Path) -> SourceMesh:
+    """The triangles of all solids of an STL file; corners at the same place are one point."""
+    try:
+        corners = read_stl(path).corners
+    except BadSurface as error:
+        raise DatasetError(f"{path}: cannot be read as a mesh: {error}") from error
+    points, nodes = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
+    return SourceMesh(path, points, [CellBlock("triangle", nodes.reshape(-1, 3), "triangle")])
 
 
 def _by_meshio(path: Path, copy: Path | None = None) -> SourceMesh:
