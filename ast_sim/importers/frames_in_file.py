@@ -152,7 +152,7 @@ def _require_plain(path: Path, series: list[ET.Element]) -> None:
 
 
 @contextlib.contextmanager
-def _beside(path: Path, tree: ET.ElementTree) -> Iterator[Path]:
+def _beside(path: Path, tree: ET.ElementTree[Any]) -> Iterator[Path]:
     """An XDMF file; or a copy, if numbers stand in binary files beside it, which meshio looks for in the folder in
     which the process runs: the copy names them in full."""
     binary = [item for item in tree.iter("DataItem") if item.get("Format") == "Binary" and item.text]
