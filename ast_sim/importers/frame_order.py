@@ -111,26 +111,38 @@ def _whole_numbers(path: Path) -> list[tuple[int, str]]:
 
 
 def _collection(source: Path) -> FrameFiles:
-    """The files that a PVD file lists, by their time; files of one time are the parts of one frame."""
+    """The files that a PVD file lists, by their time; files of one time are the parts of one frame, in the order of
+    their groups and numbers."""
     try:
         root = ElementTree.parse(source).getroot()
         entries = [
-            (float(entry.get("timestep", "nan")), entry.attrib["file"]) for entry in root.iterfind("Collection/DataSet")
+            (float(entry.get("timestep", "nan")), _part(entry), entry.attrib["file"])
+            for entry in root.iterfind("Collection/DataSet")
         ]
     except (OSError, ElementTree.ParseError, ValueError, KeyError) as error:
         raise DatasetError(f"{source}: is damaged or no PVD file: {error}") from error
     if not entries:
         raise DatasetError(f"{source}: lists no frames (no DataSet in a Collection)")
-    times = [time for time, _ in entries]
+    times = [time for time, _, _ in entries]
     if len(entries) > 1 and not np.isfinite(times).all():
         raise DatasetError(f"{source}: every frame needs a timestep")
-    frames: dict[float, list[Path]] = {}
-    for time, name in sorted(entries, key=lambda one: one[0]):
-        frames.setdefault(time, []).append(_listed(source, name))
+    frames: dict[float, list[tuple[tuple[str, float], Path]]] = {}
+    for time, part, name in sorted(entries, key=lambda one: one[0]):
+        frames.setdefault(time, []).append((part, _listed(source, name)))
     counts = {len(files) for files in frames.values()}
     if len(counts) > 1:
         raise DatasetError(f"{source}: lists {min(counts)} to {max(counts)} files for a time; must be equally many")
-    return FrameFiles(list(frames.values()), list(frames) if len(frames) > 1 else None)
+    if all(len({part for part, _ in files}) == len(files) for files in frames.values()) and counts != {1}:
+        frames = {time: sorted(files) for time, files in frames.items()}
+        if len({tuple(part for part, _ in files) for files in frames.values()}) > 1:
+            raise DatasetError(f"{source}: lists other parts for one time than for another")
+    ordered_files = [[file for _, file in files] for files in frames.values()]
+    return FrameFiles(ordered_files, list(frames) if len(frames) > 1 else None)
+
+
+def _part(entry: ElementTree.Element) -> tuple[str, float]:
+    """The group and the number of a part of a frame."""
+    return entry.get("group", ""), float(entry.get("part", "0"))
 
 
 def _listed(source: Path, name: str) -> Path:

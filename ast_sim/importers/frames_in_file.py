@@ -15,7 +15,8 @@ import numpy as np
 
 from ast_sim.importers.decks.deck_mesh import deck_mesh
 from ast_sim.importers.formats.gmsh_files import gmsh_mesh
-from ast_sim.importers.formats.source_mesh import SourceMesh, from_meshio
+from ast_sim.importers.formats.source_mesh import CellBlock, SourceMesh, from_meshio
+from ast_sim.importers.formats.stl_file import BadSurface, read_stl
 from ast_sim.importers.formats.vtk_files import ENDINGS, is_dyna, vtk_frames
 from ast_sim.support.errors import DatasetError
 
@@ -47,9 +48,10 @@ def frames_in(path: Path) -> Iterator[SourceMesh]:
         yield deck_mesh(path)
     elif ending == ".msh" and b"$MeshFormat" in _beginning(path):
         yield gmsh_mesh(path)
+    elif ending == ".stl":
+        yield _surface(path)
     elif ending in (".xdmf", ".xmf"):
-        with _beside(path) as copy:
-            yield from _xdmf_frames(path, copy)
+        yield from _xdmf_frames(path)
     else:
         yield _by_meshio(path)
 
@@ -57,6 +59,16 @@ def frames_in(path: Path) -> Iterator[SourceMesh]:
 def _beginning(path: Path) -> bytes:
     with path.open("rb") as file:
         return file.read(1 << 16)
+
+
+def _surface(path: Path) -> SourceMesh:
+    """The triangles of all solids of an STL file; corners at the same place are one point."""
+    try:
+        corners = read_stl(path).corners
+    except BadSurface as error:
+        raise DatasetError(f"{path}: cannot be read as a mesh: {error}") from error
+    points, nodes = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
+    return SourceMesh(path, points, [CellBlock("triangle", nodes.reshape(-1, 3), "triangle")])
 
 
 def _by_meshio(path: Path, copy: Path | None = None) -> SourceMesh:
@@ -83,16 +95,72 @@ def _told(error: BaseException, printed: str = "") -> str:
     return f"meshio does not know {key}" if key is not None else f"meshio stopped: {' '.join(str(error).split())}"
 
 
-@contextlib.contextmanager
-def _beside(path: Path) -> Iterator[Path]:
-    """An XDMF file; or a copy, if numbers stand in binary files beside it, which meshio looks for in the folder in
-    which the process runs: the copy names them in full."""
+def _xdmf_frames(path: Path) -> Iterator[SourceMesh]:
+    """The frames of a series; a file without a series is one frame. Frames that have a geometry or cells of their own
+    keep them; meshio's reader of series takes those of the first."""
+    import meshio
+
     try:
         tree = ET.parse(path)
     except (ET.ParseError, OSError, ValueError, LookupError) as error:
         raise DatasetError(f"{path}: cannot be read as a mesh: it is no XML: {error}") from error
+    series = tree.findall("Domain/Grid[@GridType='Collection']")
+    with _beside(path, tree) as copy:
+        if not series:
+            yield _by_meshio(path, copy)
+            return
+        _require_plain(path, series)
+        try:
+            with meshio.xdmf.TimeSeriesReader(copy) as reader:
+                shared = reader.read_points_cells()
+                for step, grid in enumerate(reader.collection):
+                    points, cells = _own_mesh(reader, grid, shared)
+                    reader.cells = cells
+                    time, point_data, cell_data = reader.read_data(step)
+                    values: Any = cell_data
+                    frame = meshio.Mesh(np.asarray(points), cells, point_data, values)
+                    yield replace(from_meshio(frame, path), time=float(time))
+        except DatasetError:
+            raise
+        except (Exception, SystemExit) as error:
+            raise DatasetError(f"{path}: cannot be read as a mesh: {_told(error)}") from error
+
+
+def _own_mesh(reader: Any, grid: ET.Element, shared: tuple[Any, Any]) -> tuple[Any, Any]:
+    """The points and cells of a grid; those of the first grid where it has none of its own."""
+    if grid.find("Geometry") is None and grid.find("Topology") is None:
+        return shared
+    reader.mesh_grid = grid
+    points, cells = reader.read_points_cells()
+    return shared[0] if points is None else points, cells or shared[1]
+
+
+def _require_plain(path: Path, series: list[ET.Element]) -> None:
+    """Raise DatasetError unless there is one series over time, and each of its frames is one grid with its time."""
+    if len(series) > 1:
+        raise DatasetError(
+            f"{path}: holds {len(series)} series of frames, and one can be read: write all bodies and fields into one"
+        )
+    kind = series[0].get("CollectionType")
+    if kind != "Temporal":
+        raise DatasetError(
+            f"{path}: holds a collection of the type {kind!r}; must be 'Temporal', a grid for each frame"
+        )
+    for number, grid in enumerate(series[0]):
+        if grid.tag != "Grid" or grid.get("GridType") == "Collection" or grid.find("Time[@Value]") is None:
+            raise DatasetError(f"{path}: entry {number} of the series is no single grid with a Time of its own")
+
+
+@contextlib.contextmanager
+def _beside(path: Path, tree: ET.ElementTree[Any]) -> Iterator[Path]:
+    """An XDMF file; or a copy, if numbers stand in binary files beside it, which meshio looks for in the folder in
+    which the process runs: the copy names them in full."""
     binary = [item for item in tree.iter("DataItem") if item.get("Format") == "Binary" and item.text]
     for item in binary:
+        if item.get("Endian") == "Big" or item.get("Seek", "0") != "0" or item.get("Compression", "Raw") != "Raw":
+            raise DatasetError(
+                f"{path}: its binary numbers must be plain ones of this machine, from the start of a file"
+            )
         item.text = str(path.parent.resolve() / str(item.text).strip())
     if not binary:
         yield path
@@ -104,24 +172,3 @@ def _beside(path: Path) -> Iterator[Path]:
                 item.text = str(path.parent.resolve() / item.text.strip())
         tree.write(copy)
         yield copy
-
-
-def _xdmf_frames(path: Path, copy: Path) -> Iterator[SourceMesh]:
-    """The frames of a series that meshio or FEniCS has written; a file without a series is one frame."""
-    import meshio
-
-    if b"CollectionType" not in _beginning(path):
-        yield _by_meshio(path, copy)
-        return
-    try:
-        with meshio.xdmf.TimeSeriesReader(copy) as reader:
-            points, cells = reader.read_points_cells()
-            for step in range(reader.num_steps):
-                time, point_data, cell_data = reader.read_data(step)
-                values: Any = cell_data
-                frame = meshio.Mesh(np.asarray(points), cells, point_data, values)
-                yield replace(from_meshio(frame, path), time=float(time))
-    except DatasetError:
-        raise
-    except (Exception, SystemExit) as error:
-        raise DatasetError(f"{path}: cannot be read as a mesh: {_told(error)}") from error

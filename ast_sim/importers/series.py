@@ -98,6 +98,13 @@ class _Frames:
         whole = len(known) == len(self.times) > 1 and np.isfinite(known).all() and (np.diff(known) > 0).all()
         return tuple(known) if whole else None
 
+    def doubts(self) -> list[str]:
+        """A note if the times of all frames are known and do not ascend."""
+        if self.ascending_times() is not None or None in self.times or len(self.times) < 2:
+            return []
+        listed = ", ".join(f"{time:g}" for time in self.times[:6]) + (", ..." if len(self.times) > 6 else "")
+        return [f"the times of the frames do not ascend ({listed}): the frames stand as in the file, without times"]
+
 
 def read_series(
     source: Path,
@@ -200,6 +207,10 @@ def _read_frames(
             values = raw_field(frame, "point" if place == "node" else "cell", names.stress or "von_mises")
             values = von_mises(values, order) if order else values[:, 0]
             kept.stresses.append(values if place == "node" or cells is None else values[cells])
+        elif "von_mises" in {*frame.point_fields, *frame.cell_fields}:
+            raise DatasetError(
+                f"{frame.path}: holds 'von_mises', which the first frame lacks: write it into each frame, or into none"
+            )
     assert first is not None and stitching is not None
     files, times = frame_files(source)
     if source.is_dir():
@@ -209,6 +220,8 @@ def _read_frames(
         notes += said
     elif times is not None:
         kept.times = list(times)
+    else:
+        notes += kept.doubts()
     return mesh_of(first, stitching, corners), kept, notes, place
 
 

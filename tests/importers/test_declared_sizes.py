@@ -9,7 +9,9 @@ import zlib
 import meshio
 import numpy as np
 import pytest
+import pyvista
 from blocks import block
+from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter, vtkXMLUnstructuredGridWriter
 
 from ast_sim.importers.mesh_file import read_mesh
 from ast_sim.support.errors import DatasetError
@@ -94,3 +96,39 @@ def test_appended_arrays(tmp_path, raw):
         read_mesh(appended(tmp_path / "a.vtu", raw, factor=2))
     with pytest.raises(DatasetError, match="the array connectivity shares its data with another array"):
         read_mesh(appended(tmp_path / "a.vtu", raw, same=True))
+
+
+def written_by_vtk(path, **facts):
+    grid = pyvista.from_meshio(meshio.Mesh(SCENE.rest_position, [("tetra", SCENE.elements)]))
+    for name, values in facts.items():
+        grid.field_data[name] = values
+    writer = vtkXMLUnstructuredGridWriter()
+    writer.SetFileName(str(path))
+    writer.SetInputData(grid)
+    assert writer.Write() == 1
+    return path
+
+
+def test_facts_on_the_whole_file_may_be_many(tmp_path):
+    path = written_by_vtk(tmp_path / "a.vtu", history=np.random.default_rng(0).normal(size=200_000))
+    assert len(read_mesh(path).points) == SCENE.num_nodes
+
+
+@pytest.mark.parametrize("before", [0, 1, 7, 12, 13])
+def test_the_tag_before_the_data_may_stand_anywhere(tmp_path, before):
+    """Files are looked through in chunks of a MiB."""
+    path = written_by_vtk(tmp_path / "a.vtu")
+    data = path.read_bytes()
+    fill = (1 << 20) - before - len("<!---->") - data.index(b"<AppendedData")
+    path.write_bytes(data.replace(b"<UnstructuredGrid>", b"<UnstructuredGrid><!--" + b"x" * fill + b"-->", 1))
+    assert len(read_mesh(path).points) == SCENE.num_nodes
+
+
+def test_arrays_at_the_end_of_a_file_may_be_short(tmp_path):
+    """Strips of triangles have two short arrays, which stand last; they were called damaged."""
+    writer = vtkXMLPolyDataWriter()
+    writer.SetFileName(str(tmp_path / "a.vtp"))
+    writer.SetInputData(pyvista.Cube().triangulate().strip())
+    assert writer.Write() == 1
+    with pytest.raises(DatasetError, match="holds cells of VTK's type 6 with [0-9]+ nodes, which are not known here"):
+        read_mesh(tmp_path / "a.vtp")

@@ -206,6 +206,14 @@ EDITS = {
     ),
     "decimal comma in Poisson's ratio": (("210000., 0.3", "210000, 0,3"), "'210000, 0,3' has more entries"),
     "decimal comma in the yield stress": (("30., 0.", "30,5, 0"), "its first plastic strain is 5, and it must be 0"),
+    "displacements along other axes": (
+        ("*NODE FILE", "*TRANSFORM, NSET=FLOOR, TYPE=R\n0., 0., 1., 0., 1., 0.\n*NODE FILE, GLOBAL=NO"),
+        r"\*NODEFILE: GLOBAL=NO writes displacements along the axes of \*TRANSFORM: leave it out",
+    ),
+    "perturbation": (
+        ("*STEP, NLGEOM", "*STEP, PERTURBATION"),
+        r"\*STEP: PERTURBATION gives displacements from the step",
+    ),
     "parts": (("*HEADING", "*PART, NAME=A\n*END PART"), "has parts and instances, which CalculiX does not know"),
 }
 
@@ -275,3 +283,35 @@ def test_results_without_displacements_and_other_files(bodies, press, tmp_path):
     job, results = solved(tmp_path / "s", lines)
     with pytest.raises(DatasetError, match="holds no displacement: write U with"):
         read_series(results, NAMES, deck=job)
+
+
+PARTLY = {
+    "*NODE FILE, NSET=FLOOR": "job.frd: 17 nodes have no displacement: write U for all nodes",
+    "*NODE OUTPUT, NSET=FLOOR": "job.frd: 17 nodes have no displacement: write U for all nodes",  # binary
+    "*EL FILE, NSET=FLOOR": "job.frd: 9 nodes have no von_mises: write S for all elements",
+    "*ELEMENT OUTPUT, NSET=FLOOR": "job.frd: 9 nodes have no von_mises: write S for all elements",
+    "TIME RESET": "job.frd: two increments have the time 0.5, so their results cannot be told apart",
+}
+
+
+@pytest.mark.parametrize("how", PARTLY)
+def test_results_of_some_nodes_or_of_two_increments_in_one_are_refused(bodies, tmp_path, how):
+    """Readers give 0 to nodes that a result leaves out, and the results of the last increment of a time."""
+    keyword = how.partition(",")[0].replace("ELEMENT", "EL").replace("OUTPUT", "FILE")
+    lines = deck(*bodies, [*step(-0.05), *step(-0.02)])
+    if how == "TIME RESET":
+        lines[-lines[::-1].index("*STATIC, DIRECT") - 1] += ", TIME RESET"
+    job, results = solved(tmp_path, [how if line == keyword else line for line in lines])
+    with pytest.raises(DatasetError, match=PARTLY[how]):
+        read_series(results, NAMES, deck=job)
+
+
+def test_obstacles_need_no_stress(bodies, tmp_path):
+    lines = deck(*bodies, step(-0.05))
+    all_of_it = read_series(solved(tmp_path, lines)[1], NAMES, deck=tmp_path / "job.inp")
+    few = ["*NSET, NSET=SOFT_NODES, GENERATE", "1, 18", "*MATERIAL, NAME=SOFT"]
+    lines[(at := lines.index("*MATERIAL, NAME=SOFT")) : at + 1] = few
+    job, results = solved(tmp_path, ["*EL FILE, NSET=SOFT_NODES" if line == "*EL FILE" else line for line in lines])
+    read = read_series(results, NAMES, deck=job)
+    assert np.array_equal(read.stress[:, :18], all_of_it.stress[:, :18]) and not read.stress[:, 18:].any()
+    assert "the stress is NaN at 8 rows of obstacles: it is 0 there" in read.attributes["notes"]

@@ -186,3 +186,49 @@ def test_normals_after_the_coordinates_are_no_decimal_commas(tmp_path):
     lines = [f"{line}, 0., 0., 1." if 0 < row <= 18 else line for row, line in enumerate(path.read_text().splitlines())]
     path.write_text("\n".join(lines) + "\n")
     assert np.array_equal(read_mesh(path).points, PAD.rest_position)
+
+
+def test_nested_includes_are_named_from_the_folder_of_the_first_file(tmp_path):
+    """As Abaqus and CalculiX look for them; a file beside the including one counts where there is no other."""
+    whole = deck(tmp_path).read_text()
+    nodes, elements = whole[: whole.index("*ELEMENT")], whole[whole.index("*ELEMENT") :]
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "sub" / "mesh.inp").write_text("*INCLUDE,\nINPUT=sub/nodes.inp\n*INCLUDE, INPUT=elements.inp\n")
+    (tmp_path / "sub" / "nodes.inp").write_text(nodes)
+    (tmp_path / "sub" / "elements.inp").write_text(elements.replace("C3D4", "C3D4, ELSET=beside"))
+    (tmp_path / "job.inp").write_text("*INCLUDE, INPUT=sub/mesh.inp\n")
+    read = read_mesh(tmp_path / "job.inp")
+    assert np.array_equal(read.points, PAD.rest_position) and list(read.groups) == ["beside"]
+    (tmp_path / "elements.inp").write_text(elements.replace("C3D4", "C3D4, ELSET=first"))
+    assert list(read_mesh(tmp_path / "job.inp").groups) == ["first"]
+
+
+def test_data_of_a_keyword_in_a_file_are_named_from_the_folder_of_the_first_file(tmp_path):
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "numbers.txt").write_text("1, 2, 3\n")
+    (tmp_path / "sub" / "sets.inp").write_text("*NSET, NSET=few, INPUT=numbers.txt\n")
+    assert len(read_mesh(deck(tmp_path, "*INCLUDE, INPUT=sub/sets.inp")).groups["few"]) == 3
+
+
+@pytest.mark.parametrize(("line", "count"), [("5", 1), ("1, 9, 2, 4", 4)])
+def test_a_set_is_generated_from_two_or_three_numbers(tmp_path, line, count):
+    path = deck(tmp_path, "*NSET, NSET=some, GENERATE", line)
+    with pytest.raises(DatasetError, match=rf"deck.inp:46: has {count} numbers; must be the first, the last and"):
+        read_mesh(path)
+
+
+@pytest.mark.parametrize("before", ["", "\n"])
+def test_a_rotation_is_not_taken_for_the_shift_of_an_instance(tmp_path, before):
+    part = f"*PART, NAME=A\n{deck(tmp_path).read_text()}*END PART\n*ASSEMBLY, NAME=B\n*INSTANCE, NAME=C, PART=A\n"
+    path = tmp_path / "turned.inp"
+    path.write_text(f"{part}{before}1, 0, 0, 1, 0, 1, 90\n*END INSTANCE\n*END ASSEMBLY\n")
+    with pytest.raises(DatasetError, match="the first line of an instance is its shift, three numbers: write 0, 0, 0"):
+        read_mesh(path)
+
+
+def test_a_node_has_a_number_of_at_least_1(tmp_path):
+    """Coordinates in a line of their own are no node."""
+    path = deck(tmp_path)
+    path.write_text(path.read_text().replace("\n1, 0, 0, 0\n", "\n1,\n0, 0, 0\n"))
+    with pytest.raises(DatasetError, match="deck.inp:3: the number of a node is 0; must be at least 1"):
+        read_mesh(path)

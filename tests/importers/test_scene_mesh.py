@@ -63,6 +63,18 @@ def test_the_triangles_of_an_stl_file(tmp_path):
     assert np.bincount(scene.body).tolist() == [2 * 81 + 32, 26]
 
 
+def test_an_stl_file_in_capitals_and_one_that_is_cut_off(tmp_path):
+    faces = read_scene(MESH, **PRESCRIBED).scene.surface()
+    meshio.write(tmp_path / "a.stl", meshio.Mesh(POINTS, {"triangle": faces}), binary=False)
+    text = (tmp_path / "a.stl").read_text()
+    (tmp_path / "b.stl").write_text(text.upper())
+    scene = read_scene(tmp_path / "b.stl", obstacles=[1]).scene
+    np.testing.assert_allclose(scene.rest_position[scene.elements], POINTS[faces], rtol=1e-6)
+    (tmp_path / "b.stl").write_text(text[: len(text) // 2])
+    with pytest.raises(DatasetError, match="b.stl: cannot be read as a mesh: it is cut off after"):
+        read_scene(tmp_path / "b.stl")
+
+
 def test_a_flat_mesh_of_two_columns():
     mesh = meshio.Mesh(np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]]), {"triangle": np.array([[0, 1, 2], [0, 2, 3]])})
     scene = read_scene(mesh, clamps=["0:ymin"]).scene

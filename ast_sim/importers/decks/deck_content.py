@@ -146,6 +146,9 @@ class _Reader:
 
     def _node(self, keyword: Keyword) -> None:
         numbers, points = nodes_of(keyword)
+        if (numbers < 1).any():
+            wrong = keyword.data[int(np.argmin(numbers))]  # a node has one line: coordinates in the next are no node
+            raise DatasetError(f"{wrong.place}: the number of a node is {numbers.min()}; must be at least 1")
         kind = (keyword.options.get("SYSTEM") or "R").upper()
         if kind not in ("R", "C", "S"):
             raise keyword.error(f"SYSTEM={kind} is not known; must be R, C or S")
@@ -265,7 +268,10 @@ def _generated(keyword: Keyword) -> np.ndarray:
     """The numbers of lines `first, last, step`."""
     parts = [np.zeros(0, np.int64)]
     for line in keyword.data:
-        first, last, step = [*(whole(text, line) for text in tokens(line)), 1][:3]
+        numbers = [whole(text, line) for text in tokens(line)]
+        if len(numbers) not in (2, 3):
+            raise DatasetError(f"{line.place}: has {len(numbers)} numbers; must be the first, the last and the step")
+        first, last, step = [*numbers, 1][:3]
         if step < 1 or last < first or (last - first) // step > 10**9:
             raise DatasetError(f"{line.place}: cannot count from {first} to {last} in steps of {step}")
         parts.append(np.arange(first, last + 1, step))
@@ -289,6 +295,11 @@ def _placement(keyword: Keyword) -> tuple[np.ndarray, np.ndarray]:
     rows = [[real(text, line) for text in (*tokens(line), *[""] * 7)[:7]] for line in keyword.data]
     if len(rows) > 2:
         raise keyword.error("has more than two data lines")
+    if rows and len(tokens(keyword.data[0])) > 3:  # an empty line for no shift is no data line here
+        raise DatasetError(
+            f"{keyword.data[0].place}: the first line of an instance is its shift, three numbers: write 0, 0, 0 before"
+            " the line of a rotation"
+        )
     shift = np.array(rows[0][:3]) if rows else np.zeros(3)
     if len(rows) < 2:
         return np.eye(3), shift

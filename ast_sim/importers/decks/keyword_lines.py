@@ -71,13 +71,13 @@ def read_keywords(path: Path) -> list[Keyword]:
     while line is not None:
         if not line.text.startswith("*"):
             raise DatasetError(f"{line.place}: a data line before the first keyword: this is no deck of Abaqus")
-        line, keyword = _keyword(line, lines)
+        line, keyword = _keyword(line, lines, path)
         keywords.append(keyword)
     return keywords
 
 
-def _keyword(first: Line, lines: Iterator[Line]) -> tuple[Line | None, Keyword]:
-    """A keyword, and the line after it."""
+def _keyword(first: Line, lines: Iterator[Line], deck: Path) -> tuple[Line | None, Keyword]:
+    """A keyword of a deck, and the line after it."""
     text = first.text
     line = next(lines, None)
     # After a comma at the end, options go on in the next line. A data line does not begin with a letter and an "=".
@@ -90,7 +90,7 @@ def _keyword(first: Line, lines: Iterator[Line]) -> tuple[Line | None, Keyword]:
         keyword.data.append(line)
         line = next(lines, None)
     if "INPUT" in keyword.options and keyword.name in ("NODE", "ELEMENT", "NSET", "ELSET", "BOUNDARY"):
-        more = list(_lines(_included(first, keyword.options["INPUT"]), (first.file,)))
+        more = list(_lines(_included(first, keyword.options["INPUT"], deck), (deck, first.file)))
         wrong = next((one for one in more if one.text.startswith("*")), None)
         if wrong is not None:
             raise DatasetError(f"{wrong.place}: a keyword in a file that holds data lines of *{keyword.name} only")
@@ -114,26 +114,35 @@ def _lines(path: Path, within: tuple[Path, ...]) -> Iterator[Line]:
     """The lines of a file without comments and empty lines; includes are replaced by the lines of their file."""
     if path in within or len(within) > _DEEPEST:
         raise DatasetError(f"{path}: is included by itself")
+    lines = _own_lines(path)
+    for line in lines:
+        text = line.text
+        if not re.match(r"\*\s*include\s*,", text, re.IGNORECASE):
+            yield line
+            continue
+        if text.endswith(","):  # its options go on in the next line
+            text += next(lines, line).text
+        options = _options(line, text.partition(",")[2])
+        if not options.get("INPUT"):
+            raise DatasetError(f"{line.place}: *INCLUDE has no INPUT=")
+        first = (*within, path)[0]
+        yield from _lines(_included(line, options["INPUT"], first), (*within, path))
+
+
+def _own_lines(path: Path) -> Iterator[Line]:
     for number, text in enumerate(re.split(r"\r\n|\r|\n", _text(path)), 1):
         text = text.strip()
-        if not text or text.startswith("**"):
-            continue
-        line = Line(text, path, number)
-        if re.match(r"\*\s*include\s*,", text, re.IGNORECASE):
-            options = _options(line, text.partition(",")[2])
-            if not options.get("INPUT"):
-                raise DatasetError(f"{line.place}: *INCLUDE has no INPUT=")
-            yield from _lines(_included(line, options["INPUT"]), (*within, path))
-        else:
-            yield line
+        if text and not text.startswith("**"):
+            yield Line(text, path, number)
 
 
-def _included(line: Line, name: str) -> Path:
-    """The file that a line names: relative to the file of the line, or to the first one."""
-    given = Path(name)
-    for candidate in (line.file.parent / given, line.file.parent / name.replace("\\", "/")):
-        if candidate.is_file():
-            return candidate
+def _included(line: Line, name: str, first: Path) -> Path:
+    """The file that a line names. Abaqus and CalculiX look for it where the job runs: in the folder of the `first`
+    file. Other programs name it as it lies from the file of the line."""
+    for folder in (first.parent, line.file.parent):
+        for candidate in (folder / name, folder / name.replace("\\", "/")):
+            if candidate.is_file():
+                return candidate
     raise DatasetError(f"{line.place}: includes {name}, which does not exist")
 
 

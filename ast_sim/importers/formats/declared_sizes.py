@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import base64
 import binascii
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,14 +23,16 @@ from ast_sim.support.errors import DatasetError
 # No linear or quadratic cell of VTK has more nodes, apart from Lagrange cells of a high order.
 _MOST_NODES = 216
 
-# The most bytes of an array of facts on the whole file, such as its time.
+# The bytes of an array of facts on the whole file, such as its time: so many always, more if it declares them.
 _FACTS = 1 << 20
+_MOST_FACTS = 1 << 26
 
 # What a byte of a file can become: LZMA and zlib pack nothing more tightly than that; as text a number has two bytes.
 _RATIO_PACKED = 8192
 _RATIO_PLAIN = 4
 
 _CHUNK = 1 << 20
+_APPENDED = b"<AppendedData"
 _Found = TypeVar("_Found")
 
 _BYTES = {"8": 1, "16": 2, "32": 4, "64": 8}
@@ -118,7 +121,9 @@ def _scanned(path: Path) -> Declared:
     before = 0
     with path.open("rb") as file:
         while chunk := file.read(_CHUNK):
-            mark = chunk.find(b"<AppendedData")
+            while b"<" in chunk[-len(_APPENDED) :] and (more := file.read(len(_APPENDED))):
+                chunk += more  # the tag must not be cut
+            mark = chunk.find(_APPENDED)
             if mark >= 0:  # what follows its tag is no text of XML if it is raw
                 chunk += file.read(1024)
                 end = chunk.index(b"_", chunk.index(b">", mark))
@@ -166,10 +171,11 @@ def _require_sizes(path: Path, declared: Declared) -> None:
 
 def _limit(array: Array, pieces: list[tuple[int, int]]) -> int:
     """The bytes that an array may have."""
-    if array.place == "FieldData" or not 0 <= array.piece < len(pieces):
-        return _FACTS
-    points, cells = pieces[array.piece]
     columns = int(array.attributes.get("NumberOfComponents") or 1)
+    if array.place == "FieldData" or not 0 <= array.piece < len(pieces):
+        declared = 8 * columns * int(array.attributes.get("NumberOfTuples") or 0)
+        return max(_FACTS, min(declared, _MOST_FACTS))
+    points, cells = pieces[array.piece]
     rows = points if array.place in ("Points", "PointData") else cells
     if array.place not in ("Points", "PointData", "CellData"):  # of the cells themselves
         columns = 1 if array.name == "types" else _MOST_NODES  # dolfin's offsets are as long as its connectivity
@@ -185,6 +191,7 @@ def _first_bytes(file: Any, declared: Declared, array: Array) -> bytes:
         text = file.read(64)
         if declared.appended == "raw":
             return text
+    text = re.split(rb"[^A-Za-z0-9+/=]", text, maxsplit=1)[0]  # what follows the last array is no data
     text = text[: len(text) // 4 * 4]
     return base64.b64decode(text.partition(b"=")[0][: len(text.partition(b"=")[0]) // 4 * 4] or text)
 

@@ -28,6 +28,8 @@ from typing import Any
 
 import numpy as np
 
+from ast_sim.importers.formats.frd_results import partly_given, read_frd_headers
+
 _ENDINGS_OF_EXODUS = {".e", ".ex2", ".exo", ".exoii", ".exii", ".g", ".gen"}
 
 
@@ -136,16 +138,24 @@ class _Opened:
 
 @dataclass
 class _Results:
-    """An .frd file of CalculiX, and the times of its frames."""
+    """An .frd file of CalculiX, the times of its frames, and of each time the results that only some nodes have: their
+    names and these nodes."""
 
     reader: Any
     times: list[float | None]
+    partial: dict[float, list[tuple[str, np.ndarray]]]
 
     def frame(self, step: int) -> dict[str, np.ndarray]:
         if self.times[step] is not None:
             self.reader.set_active_time_point(step)
         arrays = _arrays_of((self.reader.read(), ""))
         arrays["global"] = arrays.pop("point original_node_ids")
+        for result, nodes in self.partial.get(self.times[step] or 0.0, []):
+            for name in arrays:  # also STRESS_Mises, which the reader computes; it fills with zeros
+                if name == f"point {result}" or name.startswith(f"point {result}_"):
+                    values = arrays[name].astype(np.float64)
+                    values[~np.isin(arrays["global"], nodes)] = np.nan
+                    arrays[name] = values
         return arrays
 
 
@@ -159,7 +169,11 @@ def _opened(path: Path, changed: int, size: int) -> _Opened | _Results:
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # elements that it skips
             reader = pyvista_frd.FRDReader(path)
-        return _Results(reader, [*reader.time_values] or [None])
+        (declared, _), results = read_frd_headers(path)
+        partial: dict[float, list[tuple[str, np.ndarray]]] = {}
+        for result, nodes in partly_given(path, results, declared):
+            partial.setdefault(result.time, []).append((result.name, nodes))
+        return _Results(reader, [*reader.time_values] or [None], partial)
     if ending in _ENDINGS_OF_EXODUS:
         return _exodus(path)
     if path.name.lower().startswith("d3plot") or ending == ".d3plot":
@@ -227,6 +241,8 @@ def _exodus(path: Path) -> _Opened:
     reader.GenerateGlobalNodeIdArrayOn()
     for kind in (Reader.NODAL, Reader.ELEM_BLOCK, Reader.NODE_SET):
         reader.SetAllArrayStatus(kind, 1)
+    for index in range(reader.GetNumberOfObjects(Reader.NODE_SET)):
+        reader.SetObjectStatus(Reader.NODE_SET, index, 1)  # VTK leaves sets out unless it is asked for them
     facts = {"declared": [reader.GetTotalNumberOfNodes(), reader.GetTotalNumberOfElements()]}
     return _Opened(reader, _times(reader), reader.SetTimeStep, facts)
 
@@ -251,10 +267,11 @@ def _time_of(data: Any) -> float | None:
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
     facts = data.GetFieldData()
-    for name in ("TimeValue", "TIME_VALUE", "TIME"):
-        array = facts.GetArray(name) if facts is not None else None
-        if array is not None and array.GetNumberOfValues() == 1:
-            return float(vtk_to_numpy(array).ravel()[0])
+    arrays = [facts.GetArray(index) for index in range(facts.GetNumberOfArrays())] if facts is not None else []
+    named = {(array.GetName() or "").lower(): array for array in arrays if array is not None}  # None: a text
+    for name in ("timevalue", "time_value", "time"):
+        if name in named and named[name].GetNumberOfValues() == 1:
+            return float(vtk_to_numpy(named[name]).ravel()[0])
     return None
 
 

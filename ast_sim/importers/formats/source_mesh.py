@@ -163,4 +163,17 @@ def _node_groups(mesh: meshio.Mesh) -> dict[str, np.ndarray]:
             pairs = zip(mesh.cells, rows, strict=True)
             nodes = [block.data[np.asarray(chosen, int)].ravel() for block, chosen in pairs if chosen is not None]
             groups[name] = np.unique(np.concatenate(nodes)) if nodes else np.zeros(0, np.int64)
-    return groups
+    return groups | _groups_of_families(mesh)
+
+
+def _groups_of_families(mesh: meshio.Mesh) -> dict[str, np.ndarray]:
+    """The groups of a MED file. Its points and cells belong to families, and a family to some groups."""
+    tagged = [(mesh.point_data.get("point_tags"), np.arange(len(mesh.points)), getattr(mesh, "point_tags", {}))]
+    for block, tags in zip(mesh.cells, mesh.cell_data.get("cell_tags", []), strict=False):
+        tagged.append((tags, np.asarray(block.data), getattr(mesh, "cell_tags", {})))
+    nodes: dict[str, list[np.ndarray]] = {}
+    for tags, rows, families in tagged:
+        for family, names in families.items() if tags is not None else ():
+            for name in names:
+                nodes.setdefault(name, []).append(rows[np.asarray(tags) == family].ravel())
+    return {name: np.unique(np.concatenate(parts)).astype(np.int64) for name, parts in nodes.items()}

@@ -8,7 +8,6 @@ from __future__ import annotations
 import atexit
 import contextlib
 import json
-import mmap
 import os
 import re
 import signal
@@ -29,6 +28,7 @@ from ast_sim.importers.formats.declared_sizes import (
     needed_bytes,
     stored_in_hdf,
 )
+from ast_sim.importers.formats.frd_results import read_frd_headers
 from ast_sim.importers.formats.source_mesh import SourceMesh
 from ast_sim.importers.formats.together import together
 from ast_sim.importers.formats.vtk_cells import blocks_of
@@ -51,10 +51,6 @@ _SECONDS_PER_MEGABYTE = 2
 
 # Bits of VTK's array of ghosts: copies of the cells of another piece, cells that finer ones replace, hidden cells.
 _GHOST_CELL = 1 | 8 | 32
-
-# The line before a result of CalculiX: name, time, number of nodes, a text, and the kind of the analysis.
-_FRD_RESULT = re.compile(rb"^  100C.{50}(..)", re.MULTILINE)
-_FRD_MODES = {b"2": "modes of vibration", b"4": "modes of buckling"}
 
 Answer = tuple[dict[str, Any], list[dict[str, np.ndarray]]]
 
@@ -131,7 +127,8 @@ def _checked(path: Path) -> tuple[list[tuple[int, int]], int]:
     if ending == ".vtkhdf" or (ending in EXODUS and _is_hdf(path)):
         return [], _OWN_BYTES + _COPIES * stored_in_hdf(path, "VTKHDF" if ending == ".vtkhdf" else "/")
     if ending == ".frd":
-        return _of_frd(path), _OWN_BYTES + _LARGEST_RATIO * size
+        (nodes, elements), _ = read_frd_headers(path)
+        return [(nodes, elements)], _OWN_BYTES + _LARGEST_RATIO * size
     if is_dyna(path):
         size = sum(part.stat().st_size for part in path.parent.glob(f"{path.name}*"))
     return [], _OWN_BYTES + _LARGEST_RATIO * size
@@ -152,26 +149,6 @@ def _of_pieces(path: Path) -> tuple[list[tuple[int, int]], int]:
             pieces += declared.pieces
             budget += _COPIES * (needed_bytes(declared) + file.stat().st_size)
     return (pieces if path.suffix.lower() == ".pvtu" else []), budget
-
-
-def _of_frd(path: Path) -> list[tuple[int, int]]:
-    """The numbers of nodes and elements that CalculiX writes before them.
-
-    Raises:
-        DatasetError: the results are modes, which are no frames of a motion.
-    """
-    counts = []
-    with path.open("rb") as file, contextlib.closing(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)) as content:
-        for result in _FRD_RESULT.finditer(content):
-            if result[1].strip() in _FRD_MODES:
-                raise DatasetError(
-                    f"{path}: holds {_FRD_MODES[result[1].strip()]}, which are no frames of a motion: write the results"
-                    " of a *STATIC or *DYNAMIC step"
-                )
-        for key in (b"2C", b"3C"):
-            declared = re.search(rb" {4}" + key + rb" +([0-9]+) ", content)  # no new line precedes it in a binary file
-            counts.append(int(declared[1]) if declared else 0)
-    return [(counts[0], counts[1])]
 
 
 def _is_hdf(path: Path) -> bool:

@@ -34,6 +34,7 @@ _NAMED = {
 _LOADS = {"CLOAD", "DLOAD", "DSLOAD", "TEMPERATURE", "DFLUX", "CFLUX", "FILM", "RADIATE", "PRETENSIONSECTION"}
 _CONSTRAINTS = {"EQUATION", "MPC", "COUPLING", "KINEMATIC", "DISTRIBUTING", "DISTRIBUTINGCOUPLING", "TIE"}
 _PROCEDURES = {"STATIC", "DYNAMIC", "VISCO"}
+_OUTPUT = {"NODEFILE", "NODEOUTPUT"}
 _READ = {"BOUNDARY", "RIGIDBODY", "STEP", "ENDSTEP", *_PROCEDURES, *MATERIAL_KEYWORDS}
 
 
@@ -79,18 +80,32 @@ def read_job(path: Path) -> Job:
     *RIGID BODY whose reference node is prescribed. They are obstacles where a whole body is prescribed, else handles.
 
     Raises:
-        DatasetError: a line cannot be read, or the deck has parts and instances; the text names the file and the line.
+        DatasetError: a line cannot be read, the deck has parts and instances, or its results are no positions of
+            frames; the text names the file and the line.
     """
     deck = read_deck(path)
     if deck.parts:
         raise DatasetError(
             f"{path}: has parts and instances, which CalculiX does not know: its results are of another deck"
         )
+    _require_plain_results(deck)
     mesh = mesh_of_deck(deck, _READ)
     conditions = _conditions(deck, mesh)
     materials, more = material_columns(deck)
     mesh.notes.extend([*conditions.notes, *more, *_not_in_a_scene(deck)])
     return Job(mesh, _node_type(mesh, conditions), materials, _ends(deck))
+
+
+def _require_plain_results(deck: Deck) -> None:
+    """Check that displacements are written along x, y and z, and from rest."""
+    turned = any(keyword.name == "TRANSFORM" for keyword in deck.keywords)
+    for keyword in deck.keywords:
+        if turned and keyword.name in _OUTPUT and keyword.options.get("GLOBAL", "").upper() == "NO":
+            raise keyword.error("GLOBAL=NO writes displacements along the axes of *TRANSFORM: leave it out")
+        if keyword.name == "STEP" and "PERTURBATION" in keyword.options:
+            raise keyword.error(
+                "PERTURBATION gives displacements from the step before, which are no frames of a motion"
+            )
 
 
 def _conditions(deck: Deck, mesh: SourceMesh) -> _Conditions:

@@ -13,6 +13,7 @@ from ast_sim.importers.formats.source_mesh import SourceMesh
 from ast_sim.importers.formats.vtk_files import vtk_frames
 from ast_sim.importers.solved_jobs.job import Job
 from ast_sim.importers.stress import order_of, von_mises
+from ast_sim.scene import NodeType
 from ast_sim.support.errors import DatasetError
 
 # The coordinates of a deck and of its results may differ by this share of the size of the mesh; results have 6 digits.
@@ -84,7 +85,26 @@ def _fields(job: Job, frame: SourceMesh, wanted: Sequence[str]) -> dict[str, np.
     for name, values in fields.items():
         given[name] = np.full((len(job.mesh.points), *values.shape[1:]), np.nan)
         given[name][rows] = values[there]
+    _require_whole(job, frame.path, given)
     return given
+
+
+def _require_whole(job: Job, path: Path, given: dict[str, np.ndarray]) -> None:
+    """Check that all nodes of elements have a displacement, and all but those of obstacles a stress.
+
+    Raises:
+        DatasetError: some have none.
+    """
+    used = _used(job.mesh)
+    deforming = used[job.node_type[used] != NodeType.OBSTACLE]
+    for name, nodes, how in (
+        ("displacement", used, "U for all nodes (*NODE FILE without NSET=)"),
+        ("von_mises", deforming, "S for all elements (*EL FILE without NSET=)"),
+    ):
+        values = given.get(name, np.zeros(len(job.mesh.points)))[nodes]
+        lacking = np.isnan(values if values.ndim == 1 else values.sum(axis=1))
+        if lacking.any():
+            raise DatasetError(f"{path}: {lacking.sum()} nodes have no {name}: write {how}")
 
 
 def _same_nodes(job: Job, frame: SourceMesh) -> tuple[np.ndarray, np.ndarray]:
@@ -96,7 +116,7 @@ def _same_nodes(job: Job, frame: SourceMesh) -> tuple[np.ndarray, np.ndarray]:
     deck = job.mesh
     assert deck.same_point is not None and frame.same_point is not None
     numbers, rows, there = np.intersect1d(deck.same_point, frame.same_point, return_indices=True)
-    used = np.unique(np.concatenate([block.nodes.ravel() for block in deck.blocks]))
+    used = _used(deck)
     other = f"{frame.path}: holds results of another deck than {deck.path.name}"
     missing = np.setdiff1d(deck.same_point[used], numbers)
     if len(missing):
@@ -109,3 +129,8 @@ def _same_nodes(job: Job, frame: SourceMesh) -> tuple[np.ndarray, np.ndarray]:
     if counts[0] != counts[1]:
         raise DatasetError(f"{other}: it has {counts[1]} elements of a volume, the deck {counts[0]}")
     return rows, there
+
+
+def _used(mesh: SourceMesh) -> np.ndarray:
+    """The points of the elements."""
+    return np.unique(np.concatenate([block.nodes.ravel() for block in mesh.blocks]))

@@ -11,6 +11,7 @@ import numpy as np
 
 from ast_sim.dataset.layout import LENGTH_UNITS
 from ast_sim.element_topology import MIDDLES, linear_elements
+from ast_sim.importers.formats.stl_file import BadSurface
 from ast_sim.importers.mesh_file import read_mesh
 from ast_sim.importers.places import Place, marked
 from ast_sim.simulate.own_assembly.assembly_spec import (
@@ -25,7 +26,6 @@ from ast_sim.simulate.own_assembly.assembly_spec import (
 )
 from ast_sim.simulate.own_assembly.parameters import Values
 from ast_sim.simulate.shapes.cad.gmsh_process import gmsh_version, mesh_own_scale
-from ast_sim.simulate.shapes.cad.stl_file import BadSurface
 from ast_sim.simulate.shapes.cad.surface_mend import Surface, stl_surface, whole_surface
 from ast_sim.simulate.shapes.mesh import second_order, straightened
 from ast_sim.simulate.shapes.mesh_check import BadMesh, check_mesh, check_no_intersections, check_surface

@@ -12,8 +12,8 @@ from typing import Any, Protocol
 import meshio
 import numpy as np
 
+from ast_sim.importers.formats.stl_file import BadSurface
 from ast_sim.simulate.shapes.cad import gmsh_process, grammar
-from ast_sim.simulate.shapes.cad.stl_file import BadSurface
 from ast_sim.simulate.shapes.cad.surface_mend import stl_surface
 from ast_sim.simulate.shapes.mesh_check import SMALLEST_ANGLE, BadMesh, check_mesh, check_surface
 from ast_sim.simulate.shapes.parts import Part, draw_structured, oriented, volumes

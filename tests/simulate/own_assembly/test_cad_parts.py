@@ -153,3 +153,12 @@ def test_one_solid_of_several_is_chosen(ending, tmp_path):
     path.write_text(path.read_text().replace("solid = ", "solid = 3 # "))
     with pytest.raises(SimulationError, match="solid 3; it holds 2"):
         part(path)
+
+
+@pytest.mark.parametrize("share", [0.5, 0.0])
+def test_a_cad_file_that_is_cut_off_is_told(share, tmp_path):
+    path = write(tmp_path / "plate.step", "hollow")
+    file = tmp_path / "plate.step"
+    file.write_bytes(file.read_bytes()[: int(share * file.stat().st_size)])
+    with pytest.raises(SimulationError, match=r"part \(plate.step\): gmsh cannot read the file: it is damaged"):
+        part(path)

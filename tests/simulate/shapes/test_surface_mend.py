@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ast_sim.simulate.shapes.cad.stl_file import BadSurface, read_stl
+from ast_sim.importers.formats.stl_file import BadSurface, read_stl
 from ast_sim.simulate.shapes.cad.surface_mend import solids_of, stl_surface, whole_surface
 from ast_sim.simulate.shapes.mesh_check import BadMesh, boundary, check_surface
 from ast_sim.simulate.shapes.parts import rectilinear
@@ -44,6 +44,7 @@ CUBES = {
     "tabs and CRLF": text(cube()).replace("  ", "\t").replace("\n", "\r\n"),
     "carriage returns": text(cube()).replace("\n", "\r"),
     "no indentation": "\n".join(line.strip() for line in text(cube()).splitlines()),
+    "a mark of the bytes' order": b"\xef\xbb\xbf" + text(cube()).encode(),
     "empty lines": "\n\n" + text(cube()).replace("\n", "\n\n"),
     "no name": text(cube(), names=[""]),
     "a name of many words": text(cube(), names=["solid facet 3 vertex (mm)"]),

@@ -24,6 +24,7 @@ from typing import Any
 
 import numpy as np
 
+from ast_sim.importers.formats.stl_file import BadSurface
 from ast_sim.simulate.shapes.cad import own_scale
 from ast_sim.simulate.shapes.cad.cad_import import (
     BadPart,
@@ -34,7 +35,6 @@ from ast_sim.simulate.shapes.cad.cad_import import (
     start,
     tetrahedra,
 )
-from ast_sim.simulate.shapes.cad.stl_file import BadSurface
 from ast_sim.simulate.shapes.cad.surface_mend import stl_surface
 
 MESHES = 5  # at most this many meshes are made to find the element size

@@ -28,6 +28,7 @@ from typing import Any
 
 import numpy as np
 
+from ast_sim.importers.formats.stl_file import BadSurface
 from ast_sim.simulate.shapes.cad.cad_import import (
     CREASE_ANGLE,
     BadPart,
@@ -38,7 +39,6 @@ from ast_sim.simulate.shapes.cad.cad_import import (
     tetrahedra,
     triangles,
 )
-from ast_sim.simulate.shapes.cad.stl_file import BadSurface
 from ast_sim.simulate.shapes.cad.surface_mend import stl_surface
 from ast_sim.simulate.shapes.parts import smallest_dihedral
 
@@ -199,7 +199,12 @@ def _make(gmsh, part: dict[str, Any], attempt: Attempt) -> tuple[list[str], bool
         notes += surface.notes
     elif "step" in part:
         gmsh.option.setString("Geometry.OCCTargetUnit", part.get("unit", ""))
-        import_step(gmsh, part["step"], attempt.mend)
+        try:
+            import_step(gmsh, part["step"], attempt.mend)
+        except Exception as error:  # gmsh raises Exception itself
+            if "Could not read file" in str(error):
+                raise BadPart("gmsh cannot read the file: it is damaged, cut off, or no CAD file") from error
+            raise
     elif "geo" in part:
         for name, value in part["arguments"].items():
             gmsh.parser.setNumber(name, [value])

@@ -13,7 +13,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from ast_sim.simulate.shapes.cad.stl_file import BadSurface, StlFile, read_stl
+from ast_sim.importers.formats.stl_file import BadSurface, StlFile, read_stl
 
 SAME_PLACE = 1e-7  # distance of corners that are one, relative to the diagonal
 CRACKS = (1e-6, 1e-5, 1e-4)  # the same where a surface is open otherwise

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 _HEADER = 84
+_MARK = b"\xef\xbb\xbf"  # with which some editors of Windows begin a text
 _TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("colour", "<u2")])
 _WORDS = re.compile(rb"[^\s]+")
 _SOLID = re.compile(rb"(?im)^[ \t]*solid\b[ \t]*(.*?)[ \t]*$")
@@ -47,6 +48,7 @@ def read_stl(path: Path) -> StlFile:
         data = path.read_bytes()
     except OSError as error:
         raise BadSurface(f"it cannot be read: {error.strerror}") from error
+    data = data.removeprefix(_MARK)
     stl = _text(data) if _is_text(data) else _binary(data)
     if not len(stl.corners):
         raise BadSurface("it holds no triangles")

@@ -1,0 +1,115 @@
+"""The results in an .frd file of CalculiX: what their headers say, and for which nodes they have values.
+
+Source: the manual of CalculiX GraphiX, chapter "Result Format". A reader that fills missing nodes with zeros makes no
+difference between a value of 0 and none.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import mmap
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ast_sim.support.errors import DatasetError
+
+# A header: name of the set, time, number of nodes, a text, kind of the analysis, number of the increment, a text and
+# the format of the numbers. Then the name of the result, and a line for each of its columns.
+_HEADER = re.compile(
+    rb"^  100C.{6}(?P<time>.{12})(?P<count>.{12}).{20}(?P<kind>..)(?P<increment>.{5}).{10}(?P<format>..)[^\n]*\n"
+    rb" -4  (?P<name>.{8})[^\n]*\n(?P<columns>(?: -5[^\n]*\n)*)",
+    re.MULTILINE,
+)
+_MODES = {b"2": "modes of vibration", b"4": "modes of buckling"}
+_TEXT_WIDTHS = {0: 5, 1: 10}  # of the number of a node, by format
+_BINARY_WIDTHS = {2: 4, 3: 8}  # of a value, by format
+
+
+@dataclass(frozen=True)
+class FrdResult:
+    """A result of an increment. `columns` are stored; `start` is where its numbers begin in the file."""
+
+    name: str
+    time: float
+    increment: bytes
+    count: int
+    columns: int
+    format: int
+    start: int
+
+    def nodes(self, content: mmap.mmap) -> np.ndarray:
+        """[count] the numbers of the nodes that it has values for."""
+        if self.format in _TEXT_WIDTHS:
+            block = content[self.start : content.find(b"\n -3", self.start - 1)]
+            numbers = re.findall(rb"^ -1(.{%d})" % _TEXT_WIDTHS[self.format], block, re.MULTILINE)
+            return np.array(numbers).astype(np.int64)
+        row = np.dtype([("node", "<i4"), ("values", f"<f{_BINARY_WIDTHS[self.format]}", self.columns)])
+        return np.frombuffer(content[self.start :][: self.count * row.itemsize], row)["node"].astype(np.int64)
+
+
+def read_frd_headers(path: Path) -> tuple[list[int], list[FrdResult]]:
+    """The numbers of nodes and elements that a file declares, and its results.
+
+    Raises:
+        DatasetError: the results are modes, which are no frames of a motion, or two increments have the same time.
+    """
+    try:
+        with _opened(path) as content:
+            counts = [_declared(content, key) for key in (b"2C", b"3C")]
+            headers = [(header.groupdict(), header.end()) for header in _HEADER.finditer(content)]
+        results = [_result(header, end) for header, end in headers]
+    except (OSError, ValueError) as error:
+        told = " ".join(str(error).split())
+        raise DatasetError(f"{path}: cannot be read as results of CalculiX: it is damaged: {told}") from error
+    modes = next((header["kind"].strip() for header, _ in headers if header["kind"].strip() in _MODES), None)
+    if modes is not None:
+        raise DatasetError(
+            f"{path}: holds {_MODES[modes]}, which are no frames of a motion: write the results of a *STATIC or"
+            " *DYNAMIC step"
+        )
+    increments: dict[float, bytes] = {}
+    for result in results:
+        if increments.setdefault(result.time, result.increment) != result.increment:
+            raise DatasetError(
+                f"{path}: two increments have the time {result.time:g}, so their results cannot be told apart: let the"
+                " time go on from step to step (no TIME RESET), and write increments that differ by more than rounding"
+            )
+    return counts, results
+
+
+def partly_given(path: Path, results: list[FrdResult], nodes: int) -> Iterator[tuple[FrdResult, np.ndarray]]:
+    """The results that have values for fewer than all `nodes`, as *NODE FILE with NSET= writes them, and the numbers
+    of the nodes that have some."""
+    few = [result for result in results if result.count < nodes]
+    if few:
+        with _opened(path) as content:
+            for result in few:
+                yield result, result.nodes(content)
+
+
+def _declared(content: mmap.mmap, key: bytes) -> int:
+    declared = re.search(rb" {4}" + key + rb" +([0-9]+) ", content)  # no new line precedes it in a binary file
+    return int(declared[1]) if declared else 0
+
+
+def _result(header: dict[str, bytes], end: int) -> FrdResult:
+    columns = [line for line in header["columns"].splitlines() if line[33:38].strip() != b"1"]  # 1: computed by others
+    return FrdResult(
+        header["name"].decode(errors="replace").strip(),
+        float(header["time"]),
+        header["increment"],
+        int(header["count"]),
+        len(columns),
+        int(header["format"]),
+        end,
+    )
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[mmap.mmap]:
+    with path.open("rb") as file, contextlib.closing(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)) as content:
+        yield content
