@@ -23,7 +23,7 @@ def small(monkeypatch, tmp_path, one_thread):
         settings = {"corrections": 0, "batch_size": 2, "statistics_pairs": 4}
         return ast_sim.train(data, folder / "run", steps=4, resume=True, **settings)
 
-    row = replace(coverage.ROWS["plates"], run=trained, generate=plates, fresh=FRESH, calibration=24)
+    row = replace(coverage.ROWS["plates"], run=trained, generate=plates, fresh=FRESH, calibration=30)
     monkeypatch.setitem(coverage.ROWS, "plates", row)
     monkeypatch.setattr(coverage, "RESULTS", tmp_path / "coverage.json")
     monkeypatch.setattr(coverage, "PAGE", tmp_path / "coverage.md")
