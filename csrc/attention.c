@@ -6,8 +6,10 @@
  *   m' = max(m, max_j x_j),   p_j = exp(x_j - m'),
  *   l' = l exp(m - m') + sum_j p_j,   o' = o exp(m - m') + sum_j p_j v_j,   and out = o / l at the end.
  *
- * The weights carry a factor 2^-shift with 2^shift >= Tk, so l <= 1 and |o| <= max |v|: nothing overflows that the
- * result would not. A row with a NaN or +inf score, or with nothing but -inf, is NaN, as x - max says.
+ * The weights carry a factor 1 / unit. The factor is 2^LIFT, so that a small weight times a small value keeps its
+ * digits, until a value above FLT_MAX 2^(-LIFT - shift) comes, with 2^shift >= Tk. From then on it is 2^-shift, so that
+ * l <= 1 and |o| <= max |v|: nothing overflows that the result would not. A row with a NaN or +inf score, or with
+ * nothing but -inf, is NaN, as x - max says.
  *
  * A task is one scene and head, QUERIES queries and one part of the keys. Only a scene of few tasks and many keys has
  * more than one part; its parts leave (m, l, o), merged in their order by the same formula. All sizes depend on the
@@ -16,6 +18,8 @@
  * Cost: 4 Tq Tk D flops a head in two products, and some 15 vector operations (26 with dropout) a vector of scores
  * between them.
  */
+#include <float.h>
+
 #include "ast.h"
 #include "attention_tiles.h"
 #include "dropout.h"
@@ -24,6 +28,7 @@ enum {
   QUERIES = 512,     /* of a task, which share the copies of its keys; the panels stay in the second cache */
   PARTED_TASKS = 16, /* a scene with fewer tasks is cut over its keys as well, */
   PART_KEYS = 1024,  /* into parts of at least this number */
+  LIFT = 40,         /* a power of 2: what small weights are raised by */
 };
 _Static_assert(QUERIES % LANES == 0 && (int)KEYS == DROPOUT_KEYS,
                "tasks hold whole panels, blocks one group of the dropout");
@@ -33,6 +38,7 @@ typedef struct {
   int64_t q0, queries, k0, keys;    /* its rows */
   int64_t chunks, parts, part_keys; /* of queries; of keys; keys of a part */
   int64_t partial_rows;             /* queries of the states that the parts leave */
+  int64_t partial_floats;           /* floats of such a state */
   int64_t first_partial;            /* floats of such states before this scene */
 } forward_cut;
 
@@ -45,9 +51,9 @@ typedef struct {
   float *partials;
 } forward_job;
 
-/* What a task knows of its queries: o [query][ROW], m and l [query]. */
+/* What a task knows of its queries: o [query][ROW], m and l [query], and the unit of all weights. */
 typedef struct {
-  float *out, *maximum, *sum;
+  float *out, *maximum, *sum, *unit;
 } forward_state;
 
 typedef struct {
@@ -55,7 +61,7 @@ typedef struct {
   float scores[KEYS * ROW];
   dropout_words words[2];
   float queries[QUERIES * MAX_D]; /* scale Q in panels */
-  float out[QUERIES * ROW], maximum[QUERIES], sum[QUERIES];
+  float out[QUERIES * ROW], maximum[QUERIES], sum[QUERIES], unit;
 } forward_scratch;
 
 /* The scene, head, queries and keys of a task. */
@@ -117,6 +123,32 @@ static void forward_panel(forward_scratch *t, const forward_state *state, int64_
   faded_product(round_up(rows, ROW_STEP), D, n, t->scores, t->values, state->out + i0 * ROW, first ? NULL : fade);
 }
 
+/* Whether one of the n rows has a number of larger magnitude. */
+static bool holds_larger(const float *rows, int64_t n, int64_t D, float limit) {
+  vf largest = {0};
+  for (int64_t i = 0; i < n; i++)
+    for (int64_t d = 0; d < D; d += VW) {
+      const vf x = vload(rows + i * ROW + d);
+      largest = vmax(vmax(x, -x), largest);
+    }
+  bool larger = false;
+  for (int64_t i = 0; i < VW; i++) larger |= largest[i] > limit;
+  return larger;
+}
+
+/* Another unit of the weights in the first rows of a state. */
+static void set_unit(const forward_state *state, int64_t rows, int64_t D, float unit) {
+  const float factor = *state->unit / unit;
+  *state->unit = unit;
+  for (int64_t i = 0; i < rows; i++) {
+    state->sum[i] *= factor;
+    for (int64_t d = 0; d < D; d += VW) {
+      float *o = state->out + i * ROW + d;
+      vstore(o, factor * vload(o));
+    }
+  }
+}
+
 /* ---- tasks ---- */
 
 static forward_cut cut_of(const ast_attention *s, int64_t b) {
@@ -127,6 +159,7 @@ static forward_cut cut_of(const ast_attention *s, int64_t b) {
   const int64_t wanted = min64(PARTED_TASKS / max64(cut.chunks * s->H, 1), divide_up(cut.keys, PART_KEYS));
   cut.part_keys = round_up(divide_up(cut.keys, max64(wanted, 1)), KEYS);
   cut.partial_rows = min64(QUERIES, round_up(cut.queries, LANES));
+  cut.partial_floats = cut.partial_rows * (ROW + 2) + VW;
   cut.parts = cut.keys ? divide_up(cut.keys, cut.part_keys) : 1;
   return cut;
 }
@@ -149,19 +182,19 @@ static forward_range find_forward_range(const forward_job *job, int64_t index, b
 static forward_state partial_of(const forward_job *job, const forward_range *t, int64_t part) {
   const forward_cut *cut = t->cut;
   const int64_t number = (t->h * cut->chunks + t->first_query / QUERIES) * cut->parts + part, rows = cut->partial_rows;
-  float *out = job->partials + cut->first_partial + number * rows * (ROW + 2);
-  return (forward_state){out, out + rows * ROW, out + rows * (ROW + 1)};
+  float *out = job->partials + cut->first_partial + number * cut->partial_floats;
+  return (forward_state){out, out + rows * ROW, out + rows * (ROW + 1), out + rows * (ROW + 2)};
 }
 
 /* out = gain o / l, maximum and sum of the task's queries */
 static void finish(const forward_job *job, const forward_range *t, const forward_state *state) {
   const ast_attention *s = job->s;
   const int64_t H = s->H, D = s->D, q0 = t->cut->q0 + t->first_query;
-  const float gain = dropout_of(s, t->b, t->h).gain, unit = (float)((int64_t)1 << t->shift);
+  const float gain = dropout_of(s, t->b, t->h).gain;
   for (int64_t i = 0; i < t->rows; i++) {
     const float l = state->sum[i] > 0 ? state->sum[i] : NAN, factor = gain / l;
     job->maximum[(q0 + i) * H + t->h] = l > 0 ? state->maximum[i] : NAN;
-    job->sum[(q0 + i) * H + t->h] = unit * l;
+    job->sum[(q0 + i) * H + t->h] = *state->unit * l;
     float *out = job->out + ((q0 + i) * H + t->h) * D;
     for (int64_t d = 0; d < D; d += VW) vstore(out + d, factor * vload(state->out + i * ROW + d));
   }
@@ -181,7 +214,8 @@ static ast_status forward_task(int64_t index, void *context) {
   forward_scratch *t = ast_scratch(sizeof *t);
   if (!t) return AST_NO_MEMORY;
   const bool whole = task.cut->parts == 1;
-  const forward_state state = whole ? (forward_state){t->out, t->maximum, t->sum} : partial_of(job, &task, task.part);
+  const forward_state state =
+      whole ? (forward_state){t->out, t->maximum, t->sum, &t->unit} : partial_of(job, &task, task.part);
   const dropout d = dropout_of(s, task.b, h);
   const int64_t panels = divide_up(rows, LANES), share = divide_up(KEYS, panels);
   for (int64_t p = 0; p < panels; p++)
@@ -189,17 +223,20 @@ static ast_status forward_task(int64_t index, void *context) {
                t->queries + p * LANES * D);
   fill_rows(0, 0, 1, panels * LANES, state.sum);
   fill_rows(-INFINITY, 0, 1, panels * LANES, state.maximum);
+  *state.unit = ldexpf(1, -LIFT);
   for (int64_t k0 = 0; k0 < task.keys; k0 += KEYS) {
     const int64_t n = min64(KEYS, task.keys - k0), row = task.cut->k0 + task.first_key + k0;
     const float *k = job->k + row * s->k_stride + h * D, *v = job->v + row * s->v_stride + h * D;
     copy_rows(k, s->k_stride, n, D, 1, t->keys);
     copy_rows(v, s->v_stride, n, D, 1, t->values);
+    if (*state.unit < 1 && holds_larger(t->values, n, D, ldexpf(FLT_MAX, -LIFT - task.shift)))
+      set_unit(&state, k0 ? panels * LANES : 0, D, ldexpf(1, task.shift));
     for (int64_t p = 0; p < panels; p++) {
       const int64_t next = KEYS + p * share, ahead = min64(share, task.keys - k0 - next);
       prefetch_rows(k + next * s->k_stride, s->k_stride, ahead, D, 0);
       prefetch_rows(v + next * s->v_stride, s->v_stride, ahead, D, 0);
       forward_panel(t, &state, p * LANES, min64(LANES, rows - p * LANES), task.first_query + p * LANES,
-                    task.first_key + k0, n, D, task.shift, k0 == 0, &d);
+                    task.first_key + k0, n, D, *state.unit < 1 ? -LIFT : task.shift, k0 == 0, &d);
     }
   }
   if (whole) finish(job, &task, &state);
@@ -214,6 +251,9 @@ static ast_status merge_task(int64_t index, void *context) {
   const forward_state into = partial_of(job, &task, 0);
   for (int64_t part = 1; part < task.cut->parts; part++) {
     const forward_state from = partial_of(job, &task, part);
+    const float unit = *from.unit > *into.unit ? *from.unit : *into.unit;
+    set_unit(&into, task.rows, D, unit);
+    set_unit(&from, task.rows, D, unit);
     float fade[QUERIES], weight[QUERIES];
     for (int64_t i = 0; i < task.rows; i += VW) {
       const vf before = vload(into.maximum + i), other = vload(from.maximum + i), now = vmax(other, before);
@@ -248,7 +288,7 @@ static ast_status attention(const ast_attention *s, const float *restrict q, con
     const int64_t chunks = s->H * cuts[b].chunks, merges = cuts[b].parts > 1 ? chunks : 0;
     first_task[b + 1] = first_task[b] + chunks * cuts[b].parts;
     first_merge[b + 1] = first_merge[b] + merges;
-    floats += merges * cuts[b].parts * cuts[b].partial_rows * (ROW + 2);
+    floats += merges * cuts[b].parts * cuts[b].partial_floats;
   }
   float *partials = ast_scratch(floats * (int64_t)sizeof *partials);
   if (!partials) return AST_NO_MEMORY;

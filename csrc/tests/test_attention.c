@@ -279,6 +279,30 @@ static void test_large_values(const ast_kernels *kernels) {
   free_answer(r), free_problem(a);
 }
 
+/* Values near the smallest of float32 among many keys keep their digits; so do the others before one of FLT_MAX comes,
+ * in the same part of the keys or in another. */
+static void test_small_values(const ast_kernels *kernels) {
+  const int64_t queries = 3;
+  for (int64_t keys = 1000; keys <= 20000; keys *= 20) {
+    problem a = new_problem(1, &queries, &keys, 1, 16, 0, 0);
+    for (int64_t j = 0; j < keys * 16; j++) a.v[j] = 1;
+    answer ones = solve(kernels, &a);
+    for (int64_t j = 0; j < keys * 16; j++) a.v[j] = 0x1p-123f;
+    answer r = solve(kernels, &a);
+    for (int64_t i = 0; i < queries * 16; i++)
+      CHECK(fabs(ldexp((double)r.out[i], 123) / (double)ones.out[i] - 1) < 2e-7, "%lld keys: out is %g, not %g",
+            (long long)keys, (double)r.out[i], ldexp((double)ones.out[i], -123));
+    for (int64_t j = 0; j < keys * 16; j++) a.k[j] = 0, a.v[j] = j < keys * 8 ? 1 : 3e38f;
+    answer s = solve(kernels, &a);
+    for (int64_t i = 0; i < queries * 16; i++)
+      CHECK(fabs((double)s.out[i] / 1.5e38 - 1) < 1e-5, "%lld keys: out is %g", (long long)keys, (double)s.out[i]);
+    for (int64_t i = 0; i < queries; i++)
+      CHECK(fabs((double)s.sum[i] / (double)keys - 1) < 1e-5, "the sum of %lld weights is %g", (long long)keys,
+            (double)s.sum[i]);
+    free_answer(ones), free_answer(r), free_answer(s), free_problem(a);
+  }
+}
+
 /* Rows of q, k and v as slices of one projection, and their gradients as slices of its gradient. */
 static void test_row_strides(const ast_kernels *kernels) {
   const int64_t tokens = 150, H = 2, D = 16, row = H * D;
@@ -315,6 +339,7 @@ static void test(const ast_kernels *kernels) {
   test_same_bits(kernels);
   test_not_finite(kernels);
   test_large_values(kernels);
+  test_small_values(kernels);
   test_row_strides(kernels);
   test_same_bits_on_threads(kernels); /* last: it takes the pool away */
 }

@@ -158,6 +158,15 @@ def test_no_overflow_that_the_result_does_not_have():
     assert (lse == 3e38).all()
 
 
+@pytest.mark.parametrize("keys", [1000, 20000])
+def test_small_values_among_many_keys_keep_their_digits(keys):
+    """A power of two more or less changes no digit of the output, where weight times value is below normal numbers."""
+    q, k, v, *offsets = case([3], [keys])
+    tiny = 2.0**-123
+    out, small = (attention(q, k, values, *offsets, None, 0.0, 0)[0] for values in (v, tiny * v))
+    assert ((small / tiny - out).abs() <= 1e-6 * v.abs().max()).all()
+
+
 # ---- dropout ----
 
 
