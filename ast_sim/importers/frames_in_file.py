@@ -97,7 +97,7 @@ def _told(error: BaseException, printed: str = "") -> str:
 
 def _xdmf_frames(path: Path) -> Iterator[SourceMesh]:
     """The frames of a series; a file without a series is one frame. Frames that have a geometry or cells of their own
-    keep them; meshio's reader of series takes those of the first."""
+    keep them; meshio's reader of series takes the points and cells of the first."""
     import meshio
 
     try:
@@ -127,7 +127,7 @@ def _xdmf_frames(path: Path) -> Iterator[SourceMesh]:
 
 
 def _own_mesh(reader: Any, grid: ET.Element, shared: tuple[Any, Any]) -> tuple[Any, Any]:
-    """The points and cells of a grid; those of the first grid where it has none of its own."""
+    """The points and cells of a grid; of the first grid where it has none of its own."""
     if grid.find("Geometry") is None and grid.find("Topology") is None:
         return shared
     reader.mesh_grid = grid

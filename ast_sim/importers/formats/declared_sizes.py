@@ -23,7 +23,7 @@ from ast_sim.support.errors import DatasetError
 # No linear or quadratic cell of VTK has more nodes, apart from Lagrange cells of a high order.
 _MOST_NODES = 216
 
-# The bytes of an array of facts on the whole file, such as its time: so many always, more if it declares them.
+# The bytes of an array of facts on the whole file, such as its time: always this number, more if it declares them.
 _FACTS = 1 << 20
 _MOST_FACTS = 1 << 26
 

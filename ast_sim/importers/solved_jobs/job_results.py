@@ -90,7 +90,7 @@ def _fields(job: Job, frame: SourceMesh, wanted: Sequence[str]) -> dict[str, np.
 
 
 def _require_whole(job: Job, path: Path, given: dict[str, np.ndarray]) -> None:
-    """Check that all nodes of elements have a displacement, and all but those of obstacles a stress.
+    """Check that all nodes of elements have a displacement, and all but the nodes of obstacles a stress.
 
     Raises:
         DatasetError: some have none.
