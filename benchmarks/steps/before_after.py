@@ -12,6 +12,7 @@ import json
 import statistics
 import sys
 import tempfile
+from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -57,8 +58,13 @@ def summary(seconds: dict[str, list[float]]) -> dict[str, Any]:
     return {
         "min_ms": {name: 1e3 * min(values) for name, values in seconds.items()},
         "median_ms": {name: 1e3 * statistics.median(values) for name, values in seconds.items()},
-        "ratio": statistics.median(b / n for b, n in zip(seconds["before"], seconds["now"], strict=True)),
+        "ratio": median_ratio(seconds["before"], seconds["now"]),
     }
+
+
+def median_ratio(samples: Sequence[float], others: Sequence[float]) -> float:
+    """The median of the ratios of samples to others that were measured beside them, in turns."""
+    return statistics.median(one / other for one, other in zip(samples, others, strict=True))
 
 
 def main() -> None:

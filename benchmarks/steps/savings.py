@@ -23,6 +23,7 @@ import ast_sim
 from ast_sim.support.disk import write_json, write_text
 from ast_sim.support.provenance import provenance
 from benchmarks.steps import predictions
+from benchmarks.steps.before_after import median_ratio
 
 RESULTS = Path(__file__).parents[1] / "results" / "savings.json"
 PAGE = Path(__file__).parents[2] / "docs" / "results" / "savings.md"
@@ -99,7 +100,7 @@ def page(results: dict[str, Any]) -> str:
     ]
     for row in results["rows"]:
         more, less = (row["milliseconds"][name] for name in ("more", "less"))
-        saved = 1 - statistics.median(b / a for a, b in zip(more, less, strict=True))
+        saved = 1 - median_ratio(less, more)
         lines.append(f"| {row['text']} | {_milliseconds(more)} | {_milliseconds(less)} | {100 * saved:.0f} % |")
     return "\n".join(lines)
 

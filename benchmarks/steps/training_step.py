@@ -105,7 +105,7 @@ def measure(case: scenes.Case, threads: int, repeats: int, limit: float | None, 
         if "ours" not in workers:
             raise RuntimeError(f"{case.preset}: {missing['ours']}")
         records = [
-            _record(case, what, threads, _samples(workers, what, case.steps, repeats)) for what in ("step", "rollout")
+            _record(case, what, threads, in_turns(workers, what, case.steps, repeats)) for what in ("step", "rollout")
         ]
         # Before anything is watched: what the profiler writes down lies in memory, too.
         records[0]["peak_resident_bytes"] = {name: worker.ask("resident") for name, worker in workers.items()}
@@ -121,7 +121,7 @@ def measure(case: scenes.Case, threads: int, repeats: int, limit: float | None, 
     return records
 
 
-def _samples(workers: dict[str, Worker], what: str, steps: int, repeats: int) -> dict[str, list[float]]:
+def in_turns(workers: dict[str, Worker], what: str, steps: int, repeats: int) -> dict[str, list[float]]:
     """Seconds a step, in turns."""
     samples: dict[str, list[float]] = {name: [] for name in workers}
     for _ in range(repeats):
@@ -148,10 +148,9 @@ def _record(case: scenes.Case, what: str, threads: int, samples: dict[str, list[
     return record
 
 
-def growth(small: dict, large: dict) -> float:
-    """The exponent p of seconds ~ nodes^p between two records that hold `nodes`."""
-    seconds = [record["samples"]["ours"]["min"] for record in (small, large)]
-    return math.log(seconds[1] / seconds[0]) / math.log(large["nodes"] / small["nodes"])
+def growth(nodes: tuple[int, int], seconds: tuple[float, float]) -> float:
+    """The exponent p of seconds ~ nodes^p between two sizes."""
+    return math.log(seconds[1] / seconds[0]) / math.log(nodes[1] / nodes[0])
 
 
 def line_of(record: dict) -> str:
@@ -197,7 +196,9 @@ def main() -> None:
                     record["nodes"] = case.nodes
                 before = [r for r in records if (r["preset"], r["what"]) == (case.preset, "training step")]
                 if case.preset == "abcd_xl" and before:
-                    made[0]["growth_exponent"] = growth(before[-1], made[0])
+                    small, large = before[-1], made[0]
+                    seconds = (small["samples"]["ours"]["min"], large["samples"]["ours"]["min"])
+                    large["growth_exponent"] = growth((small["nodes"], large["nodes"]), seconds)
                 for record in made:
                     print(line_of(judge(record)), flush=True)
                 records += made

@@ -6,7 +6,6 @@ neighbours, so that other work on the machine disturbs both sides alike.
 
 from __future__ import annotations
 
-import math
 import statistics
 import time
 import warnings
@@ -21,14 +20,15 @@ import torch
 import ast_sim
 from benchmarks.kernels.targets import GIGABYTE
 from benchmarks.steps import before_after, newton, predictions, scenes
+from benchmarks.steps.before_after import median_ratio
 from benchmarks.steps.step_worker import Setup
-from benchmarks.steps.training_step import Worker
+from benchmarks.steps.training_step import Worker, growth, in_turns
 
 NOW = Path(__file__).resolve().parents[2]
 TOGETHER = 64  # scenes that are predicted as one batch
 LIMIT = 600.0  # seconds of a sample of Newton steps
 MANY_NODES = (158, 500)  # nodes along a side of two plates, each of two layers: 99,856 and 1,000,000 nodes
-PLATES = {**predictions.PLATES, "train": 16, "test": TOGETHER, "nodes": 400, "progress": False}
+PLATES = {**predictions.PLATES, "nodes": 400, "progress": False}
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class Place:
 
 def training(place: Place) -> Iterator[Record]:
     """Steps of `tiny` on 8 plates of 400 nodes, as the demonstration has them."""
-    data = ast_sim.generate("deforming_plate", place.folder / "plates.h5", **PLATES).path
+    data = ast_sim.generate("deforming_plate", place.folder / "plates.h5", **{**PLATES, "train": 16}).path
     told = before_after.compare(place.before, data, threads=2, repeats=place.repeats, steps=5)
     times = told["median_ms"]
     note = f"a step {times['before']:.0f} -> {times['now']:.0f} ms"
@@ -87,17 +87,16 @@ def training(place: Place) -> Iterator[Record]:
 
 def prediction(place: Place) -> Iterator[Record]:
     """One call for a new plate of 400 nodes, alone and in a batch."""
-    data = ast_sim.generate("deforming_plate", place.folder / "plates.h5", **PLATES).path
+    data = ast_sim.generate("deforming_plate", place.folder / "plates.h5", **{**PLATES, "test": TOGETHER}).path
     told = predictions.compare({"before": place.before, "now": NOW}, data, 0, place.repeats)
     before, now = (told[name]["processor"] for name in ("before", "now"))
-    ratio = statistics.median(b / a for a, b in zip(before, now, strict=True))
+    ratio = median_ratio(now, before)
     note = f"{statistics.median(before):.1f} -> {statistics.median(now):.1f} ms of the processor"
     yield Record("time of one call, one thread, beside the state before", ratio, "times", most=0.5, note=note)
     alone, each = _alone_and_together(data, place.repeats)
-    ratio = statistics.median(b / a for a, b in zip(alone, each, strict=True))
     note = f"{1e3 * statistics.median(alone):.1f} and {1e3 * statistics.median(each):.1f} ms"
     what = f"time of each of {TOGETHER} scenes in a batch on two threads, beside one scene on one"
-    yield Record(what, ratio, "times", most=0.6, note=note)
+    yield Record(what, median_ratio(each, alone), "times", most=0.6, note=note)
 
 
 def _alone_and_together(data: Path, repeats: int) -> tuple[list[float], list[float]]:
@@ -127,42 +126,38 @@ def _alone_and_together(data: Path, repeats: int) -> tuple[list[float], list[flo
 def threads(place: Place) -> Iterator[Record]:
     """Training steps on one thread and on two."""
     for name, least in (("tiny", 1.6), ("deforming_plate", 1.7), ("abcd_xl_12k", 0.97)):
-        case = scenes.make(name, place.folder)
-        one, two = _samples(case, {"one": ("c", 1), "two": ("c", 2)}, place)
-        ratio = statistics.median(a / b for a, b in zip(one, two, strict=True))
-        note = f"{1e3 * statistics.median(one):.0f} and {1e3 * statistics.median(two):.0f} ms"
-        yield Record(f"training steps of {_title(case)} on two threads beside one", ratio, "times", least, note=note)
+        steps, one, two = _steps(name, {"one": ("c", 1), "two": ("c", 2)}, place)
+        yield Record(f"{steps} on two threads beside one", median_ratio(one, two), "times", least, note=_both(one, two))
 
 
 def beside_torch(place: Place) -> Iterator[Record]:
     """Training steps of the same model by torch's own ops, without `torch.compile`."""
     for name, least in (("tiny", 3.7), ("deforming_plate", 4.2), ("abcd_xl_12k", 4.2)):
-        case = scenes.make(name, place.folder)
-        ours, theirs = _samples(case, {"ours": ("c", 1), "torch": ("torch", 1)}, place)
-        ratio = statistics.median(b / a for a, b in zip(ours, theirs, strict=True))
-        note = f"{1e3 * statistics.median(ours):.0f} and {1e3 * statistics.median(theirs):.0f} ms"
-        what = f"plain torch, not compiled, beside ours: training steps of {_title(case)}, one thread"
-        yield Record(what, ratio, "times", least, note=note)
+        steps, ours, theirs = _steps(name, {"ours": ("c", 1), "torch": ("torch", 1)}, place)
+        what = f"plain torch, not compiled, beside ours: {steps}, one thread"
+        yield Record(what, median_ratio(theirs, ours), "times", least, note=_both(ours, theirs))
+
+
+def _both(one: list[float], other: list[float]) -> str:
+    return f"{1e3 * statistics.median(one):.0f} and {1e3 * statistics.median(other):.0f} ms"
 
 
 def _title(case: scenes.Case) -> str:
     return f"`{case.preset}` ({case.nodes:,} nodes)"
 
 
-def _samples(case: scenes.Case, kinds: dict[str, tuple[str, int]], place: Place) -> list[list[float]]:
-    """Seconds a step of each backend and number of threads, in turns."""
+def _steps(name: str, kinds: dict[str, tuple[str, int]], place: Place) -> tuple[str, list[float], list[float]]:
+    """What is trained, and the seconds of a step of two backends, each with its number of threads, in turns."""
+    case = scenes.make(name, place.folder)
     setup = Setup(str(case.data), "ast", case.preset, case.settings, str(place.folder))
     with ExitStack() as stack:
         workers = {}
-        for name, (backend, count) in kinds.items():
-            workers[name] = Worker(backend, count, setup, place.folder / f"{name}.log")
-            stack.callback(workers[name].close)
-            workers[name].ask("step", case.steps)  # fills caches
-        samples: dict[str, list[float]] = {name: [] for name in workers}
-        for _ in range(min(place.repeats, case.most_repeats)):
-            for name, worker in workers.items():
-                samples[name].append(worker.ask("step", case.steps))
-    return list(samples.values())
+        for kind, (backend, count) in kinds.items():
+            workers[kind] = Worker(backend, count, setup, place.folder / f"{kind}.log")
+            stack.callback(workers[kind].close)
+            workers[kind].ask("step", case.steps)  # fills caches
+        one, other = in_turns(workers, "step", case.steps, min(place.repeats, case.most_repeats)).values()
+    return f"training steps of {_title(case)}", one, other
 
 
 def newton_steps(place: Place) -> Iterator[Record]:
@@ -186,33 +181,30 @@ def newton_steps(place: Place) -> Iterator[Record]:
 def large_scenes(place: Place) -> Iterator[Record]:
     """A training step of `abcd_xl`, and predictions of up to a million nodes, on two threads."""
     small, large = (scenes.make(name, place.folder) for name in ("abcd_xl_12k", "abcd_xl"))
-    seconds = {}
-    for case in (small, large):
-        times, resident = _large(case.data, place, "step")
-        seconds[case.nodes] = min(times)
-    yield Record(f"memory of a training step of {_title(large)}", resident / GIGABYTE, "GB resident", most=8)
-    exponent = math.log(seconds[large.nodes] / seconds[small.nodes]) / math.log(large.nodes / small.nodes)
+    quick, _ = _large(small.data, place, "step")
+    slow, memory = _large(large.data, place, "step")
+    yield Record(f"memory of a training step of {_title(large)}", memory / GIGABYTE, "GB resident", most=8)
+    exponent = growth((small.nodes, large.nodes), (quick, slow))
     what = f"growth of a training step of `abcd_xl` from {small.nodes:,} to {large.nodes:,} nodes"
     yield Record(what, exponent, "exponent", most=0.95)
-    spent = []
-    for side in MANY_NODES:
-        data = place.folder / f"plates_{side}.h5"
-        scenes.write_plates(data, side)
-        times, resident = _large(data, place, "rollout")
-        spent.append(min(times))
-    yield Record("memory of one prediction of 1,000,000 nodes", resident / GIGABYTE, "GB resident", most=20)
-    note = f"{spent[0]:.2f} and {spent[1]:.1f} s"
+    data = [place.folder / f"plates_{side}.h5" for side in MANY_NODES]
+    for path, side in zip(data, MANY_NODES, strict=True):
+        scenes.write_plates(path, side)
+    quick, _ = _large(data[0], place, "rollout")
+    slow, memory = _large(data[1], place, "rollout")
+    yield Record("memory of one prediction of 1,000,000 nodes", memory / GIGABYTE, "GB resident", most=20)
+    note = f"{quick:.2f} and {slow:.1f} s"
     what = "time of one prediction of 1,000,000 nodes beside 99,856"
-    yield Record(what, spent[1] / spent[0], "times", most=12, note=note)
+    yield Record(what, slow / quick, "times", most=12, note=note)
 
 
-def _large(data: Path, place: Place, what: str) -> tuple[list[float], int]:
-    """Seconds of three training steps or predictions on two threads, and the bytes that were resident."""
+def _large(data: Path, place: Place, what: str) -> tuple[float, int]:
+    """The least seconds of three training steps or predictions on two threads, and the bytes that were resident."""
     settings = ["train.batch_size=1", "train.statistics_pairs=1"]
     worker = Worker("c", 2, Setup(str(data), "ast", "abcd_xl", settings, str(place.folder)), place.folder / "large.log")
     try:
         worker.ask(what)  # fills caches
-        return [worker.ask(what) for _ in range(3)], worker.ask("resident")
+        return min(worker.ask(what) for _ in range(3)), worker.ask("resident")
     finally:
         worker.close()
 

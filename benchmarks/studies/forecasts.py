@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import ast_sim
+from ast_sim.number_arrays import percent
 from ast_sim.planning.forecast import DAMPING, SPREAD, forecast
 from ast_sim.planning.trials import GROWTH, LONGEST, WIDER, Trials, candidates
 from ast_sim.support.provenance import provenance
@@ -106,23 +107,19 @@ def page(results: dict[str, Any]) -> str:
     inside = 0
     for row in shown:
         best, whole, expected = row["trials"][-1]["name"], row["whole"], row["expected"]
-        own = [f"{trial['steps']:,}: {_percent(trial['error'])}" for trial in row["trials"] if trial["name"] == best]
+        own = [f"{trial['steps']:,}: {percent(trial['error'], 3)}" for trial in row["trials"] if trial["name"] == best]
         inside += expected["low"] <= whole["error"] <= expected["high"]
-        interval = f"{_percent(expected['low'])} to {_percent(expected['high'])}"
+        interval = f"{percent(expected['low'], 3)} to {percent(expected['high'], 3)}"
         cells = [
             row["title"],
             best,
             ", ".join(own),
-            _percent(row["half"]["error"]),
-            f"{whole['steps']:,} steps: {_percent(expected['error'])} ({interval})",
-            _percent(whole["error"]),
+            percent(row["half"]["error"], 3),
+            f"{whole['steps']:,} steps: {percent(expected['error'], 3)} ({interval})",
+            percent(whole["error"], 3),
         ]
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join([*lines, "", f"{inside} of {len(shown)} trainings ended within the interval of their forecast."])
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:.3g} %"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -130,7 +127,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _said(found: dict[str, Any]) -> str:
-    return _percent(found["whole"]["error"])
+    return percent(found["whole"]["error"], 3)
 
 
 if __name__ == "__main__":
