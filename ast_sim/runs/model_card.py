@@ -82,7 +82,7 @@ def _ranges(scope: Scope) -> Iterator[tuple[str, float, float]]:
     yield "nodes", *scope.nodes
     yield f"size of the deforming bodies [{unit}]", *scope.size
     yield f"mesh spacing [{unit}]", *scope.spacing
-    yield "size of what is held, as a share of it", *scope.held
+    yield "extent of the held nodes, as a share of the size", *scope.held
     yield f"travel of prescribed nodes [{unit}]", *scope.travel
     for axis, *limits in zip("xyz", scope.motion_low, scope.motion_high, strict=True):
         yield f"displacement of prescribed nodes along {axis} [{unit}]", *limits

@@ -66,27 +66,26 @@ class Scope:
         prescribed nodes move in one frame matters where `each_frame` is predicted from the one before."""
         length = f" {self.length_unit}"
         increment = max(motion.increments(scene)) if each_frame else 0.0
+        travel = motion.travel(scene)
         for (low, high), value, text, unit in (
             ((self.corners, self.corners), scene.elements.shape[1], "the elements have {} nodes", ""),
             (self.nodes, scene.num_nodes, "the scene has {} nodes", ""),
             (self.size, size_of(scene), "the deforming bodies measure {} across", length),
             (self.spacing, spacing_of(scene), "the mesh edges have a mean length of {}", length),
             (self.held, held_share_of(scene), "the held nodes span {} of the size of the deforming bodies", ""),
-            ((0.0, self.travel[1]), motion.travel(scene), "prescribed nodes move up to {} from their start", length),
+            ((0.0, self.travel[1]), travel, "prescribed nodes move up to {} from their start", length),
             ((0.0, self.increment[1]), increment, "prescribed nodes move {} in one frame", length),
             *self._materials(scene),
         ):
             if not low - LEEWAY * abs(low) <= value <= high + LEEWAY * abs(high):
                 shown, *limits = (f"{number:.4g}{unit}" for number in (value, *dict.fromkeys((low, high))))
                 yield f"{text.format(shown)}; in training {' to '.join(limits)}"
-        yield from self._directions(scene, motion)
+        if travel <= (1 + LEEWAY) * self.travel[1]:  # else their travel tells it
+            yield from self._directions(scene, motion)
 
     def _directions(self, scene: Scene, motion: Motion) -> Iterator[str]:
-        """One sentence for each axis along which prescribed nodes move farther than in training, where their travel
-        alone does not tell it."""
+        """One sentence for each axis along which prescribed nodes move farther than in training."""
         leeway = LEEWAY * self.travel[1]
-        if motion.travel(scene) > self.travel[1] + leeway:
-            return
         for axis, low, high, *reached in zip(
             "xyz", self.motion_low, self.motion_high, *motion.extent(scene), strict=True
         ):

@@ -42,7 +42,7 @@ def whole(text: str, line: Line) -> int:
 
 def refuse_decimal_commas(line: Line, most: int, what: str) -> None:
     """Raise DatasetError if a line has more than `most` entries and none of them has a decimal point."""
-    if len(tokens(line)) > most and "." not in line.text:
+    if "." not in line.text and len(tokens(line)) > most:
         raise DatasetError(
             f"{line.place}: {line.text.strip()!r} has more entries than {what}, and no decimal point: write 4.2 for a"
             " number, not 4,2, and 1. for a whole one"

@@ -48,7 +48,8 @@ class FrdResult:
             numbers = re.findall(rb"^ -1(.{%d})" % _TEXT_WIDTHS[self.format], block, re.MULTILINE)
             return np.array(numbers).astype(np.int64)
         row = np.dtype([("node", "<i4"), ("values", f"<f{_BINARY_WIDTHS[self.format]}", self.columns)])
-        return np.frombuffer(content[self.start :][: self.count * row.itemsize], row)["node"].astype(np.int64)
+        end = self.start + self.count * row.itemsize
+        return np.frombuffer(content[self.start : end], row)["node"].astype(np.int64)
 
 
 def read_frd_headers(path: Path) -> tuple[list[int], list[FrdResult]]:
