@@ -20,7 +20,7 @@ from ast_sim.ops import TetrahedronSet, elastic_forces, join_indices
 from ast_sim.scene import Scene
 from ast_sim.support.errors import DatasetError
 
-YOUNG, POISSON = 1.0, 0.3  # where the scene has no material
+YOUNG, POISSON = 1.0, 0.3  # where the law of the material is not known
 SHARPNESS = 20.0  # forces of strains of 1 / SHARPNESS are of order one
 
 
@@ -46,8 +46,8 @@ class ElasticTetrahedra:
 
     @staticmethod
     def of(scene: Scene, material: Material) -> ElasticTetrahedra:
-        """Of one scene. Young's modulus and Poisson's ratio are taken where they are the columns of its material, and
-        allowed in all elements. Else all elements have the same stiffness.
+        """Of one scene, with Young's modulus and Poisson's ratio of its material. Where its law is not known, or they
+        are not allowed in an element, all elements have the same stiffness.
 
         Raises:
             DatasetError: the elements are no tetrahedra.
@@ -59,8 +59,8 @@ class ElasticTetrahedra:
         elements = torch.from_numpy(scene.elements.astype("int64"))
         count, corners = elements.shape
         young, poisson = np.full(count, YOUNG, np.float32), np.full(count, POISSON, np.float32)
-        if sorted(material.columns) == sorted(ELASTIC):
-            given, ratio = (material.numbers(name, scene.material).astype(np.float32) for name in ELASTIC)
+        if material.law is not None:
+            given, ratio = (np.full(count, material.numbers(name, scene.material), np.float32) for name in ELASTIC)
             if (given > 0).all() and (ratio >= 0).all() and (ratio < 0.5).all():
                 young, poisson = given, ratio
         young = young * scene.deforming_elements
