@@ -24,7 +24,7 @@ from ast_sim.support.errors import CheckpointError, ConfigError
 from ast_sim.support.toml_settings import from_values, leaves, to_toml, to_values
 
 ORIGIN = "run.json"
-VERSION = 1
+VERSION = 2  # in version 1 elastic forces, an input, had another Poisson's ratio than the scenes
 _KEYS = {"version", CONFIG, SCOPE, "data", "sha256"}
 _START = "start"  # only in a run that starts from another one
 _SPECIFICATION = "specification"  # only in a run that was trained on an assembly

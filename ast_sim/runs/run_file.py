@@ -40,7 +40,7 @@ from ast_sim.support.toml_settings import from_values, to_values
 
 SUFFIX = ".ast"
 FORMAT = "ast_sim run"
-VERSION = 1
+VERSION = 2  # as of a run's folder (`config_toml`)
 
 _FACTS, _WEIGHTS, _CARD, _LICENCE, _MANIFEST = (
     "run.json",

@@ -58,6 +58,32 @@ def test_small_strains_give_the_forces_of_the_solver(order):
     np.testing.assert_allclose(found[free], expected[free], atol=0.05 * np.abs(expected).max())
 
 
+@pytest.mark.parametrize(
+    "material",
+    [
+        Material(constants={"young": YOUNG, "poisson": POISSON, "friction": 0.2}),
+        Material(("poisson",), {"young": YOUNG}),
+        Material(("young", "poisson", "friction")),
+        Material(("friction", "poisson", "young")),
+    ],
+)
+def test_numbers_of_the_material_are_found_by_name_among_columns_and_constants(material):
+    """Constants of plates, and a third column of scenes with friction: both were once taken for no material."""
+    made = scene(1)
+    numbers = {"young": YOUNG, "poisson": POISSON, "friction": 0.2}
+    columns = np.tile(np.float32([numbers[name] for name in material.columns]), (made.num_elements, 1))
+    given = ElasticTetrahedra.of(replace(made, material=columns if material.columns else None), material)
+    expected = elasticity(made)
+    assert torch.equal(given.lame, expected.lame) and torch.equal(given.force, expected.force)
+
+
+@pytest.mark.parametrize("wrong", [0.5, -0.1])
+def test_a_ratio_that_no_material_has_is_not_taken(wrong):
+    made = replace(scene(1), material=None)
+    found = ElasticTetrahedra.of(made, Material(constants={"young": YOUNG, "poisson": wrong}))
+    assert torch.equal(found.lame, ElasticTetrahedra.of(made, Material()).lame)
+
+
 def test_second_order_forces_are_minus_the_derivative_of_the_energy():
     made = scene(2)
     rest = torch.tensor(made.rest_position, dtype=torch.float64)

@@ -44,7 +44,7 @@ def run(trained, tmp_path):
         ("config.toml", "hidden = 8\n", "hidden = \n", r"config.toml is damaged: it is not valid TOML"),
         ("config.toml", "hidden = 8\n", f"hidden = {'9' * 5000}\n", r"config.toml is damaged: it is not valid TOML"),
         ("config.toml", "[model]", "[modem]", r"config.toml: model.name is missing"),
-        ("config.toml", "version = 1", "version = 2", r"config.toml: version is 2, but .* started with 1"),
+        ("config.toml", "version = 2", "version = 3", r"config.toml: version is 3, but .* started with 2"),
         ("scope.toml", "corners = 4", "corners = 5", r"scope.toml: corners is 5, but .* started with 4"),
     ],
 )
