@@ -83,6 +83,19 @@ typedef struct {
   const float *first, *first_bias, *second, *second_bias;   /* [2F,W], [2F], [W,F], [W] */
 } ast_attention_block;
 
+/* What the block's forward pass keeps for its gradients, each NULL if it is not kept: rotated queries [Q,H*D], rotated
+ * keys and values [K,2*H*D], what attention makes of them [Q,H*D] with its maximum and sum [Q,H], y [Q,W], what enters
+ * GEGLU [Q,2F] and the hidden units [Q,F]. */
+typedef struct {
+  float *queries, *keys_values, *mixed, *maximum, *total, *y, *z, *hidden;
+} ast_attention_block_kept;
+
+/* Gradients of the shapes of the inputs, each NULL if it is not wanted. */
+typedef struct {
+  float *x, *context, *gamma, *beta, *context_gamma, *context_beta, *query, *key_value, *weight, *bias, *inner_gamma,
+      *inner_beta, *first, *first_bias, *second, *second_bias;
+} ast_attention_block_gradients;
+
 /* Two dense layers: h = max(0, [x, beside] weight1^T + bias1), y = h weight2^T + bias2, then LayerNorm if there is a
  * gamma. */
 typedef struct {
@@ -201,7 +214,10 @@ typedef struct {
                                    float *restrict dk, float *restrict dv);
 
   /* The block's vectors, out [Q,W], without dropout. D is a multiple of 16 up to 128. */
-  ast_status (*attention_block)(const ast_attention_block *s, float *restrict out);
+  ast_status (*attention_block)(const ast_attention_block *s, float *restrict out, ast_attention_block_kept kept);
+  /* Its gradients, dout [Q,W]. z is computed again if it was not kept; everything else is kept. Rotations have none. */
+  ast_status (*attention_block_backward)(const ast_attention_block *s, const float *restrict dout,
+                                         ast_attention_block_kept kept, ast_attention_block_gradients g);
 
   /* sum[r] = sum over the edges m into r, in stored order, of messages[m] = LN(W2 relu(z_m) + b2; gamma, beta), where
    * z_m = of_senders[s] + of_receivers[r] + A2 relu(A1 e_m + a1), or + e_m without an encoder; 0 without edges.
@@ -262,33 +278,34 @@ typedef struct {
 } ast_kernels;
 
 /* Every kernel of the table. */
-#define AST_KERNELS(KERNEL)       \
-  KERNEL(segment_sum)             \
-  KERNEL(segment_spread)          \
-  KERNEL(octree_build)            \
-  KERNEL(octree_coordinates)      \
-  KERNEL(octree_coarsen)          \
-  KERNEL(octree_write_level)      \
-  KERNEL(farthest_point_sample)   \
-  KERNEL(sparse_conv)             \
-  KERNEL(sparse_conv_weight)      \
-  KERNEL(attention)               \
-  KERNEL(attention_backward)      \
-  KERNEL(attention_block)         \
-  KERNEL(message)                 \
-  KERNEL(message_backward)        \
-  KERNEL(linear)                  \
-  KERNEL(linear_backward)         \
-  KERNEL(elastic_forces)          \
-  KERNEL(elastic_forces_backward) \
-  KERNEL(proximity)               \
-  KERNEL(breadth_first)           \
-  KERNEL(counting_sort)           \
-  KERNEL(mesh_edges)              \
-  KERNEL(outer_faces)             \
-  KERNEL(column_sum)              \
-  KERNEL(orthogonalize)           \
-  KERNEL(mlp)                     \
+#define AST_KERNELS(KERNEL)        \
+  KERNEL(segment_sum)              \
+  KERNEL(segment_spread)           \
+  KERNEL(octree_build)             \
+  KERNEL(octree_coordinates)       \
+  KERNEL(octree_coarsen)           \
+  KERNEL(octree_write_level)       \
+  KERNEL(farthest_point_sample)    \
+  KERNEL(sparse_conv)              \
+  KERNEL(sparse_conv_weight)       \
+  KERNEL(attention)                \
+  KERNEL(attention_backward)       \
+  KERNEL(attention_block)          \
+  KERNEL(attention_block_backward) \
+  KERNEL(message)                  \
+  KERNEL(message_backward)         \
+  KERNEL(linear)                   \
+  KERNEL(linear_backward)          \
+  KERNEL(elastic_forces)           \
+  KERNEL(elastic_forces_backward)  \
+  KERNEL(proximity)                \
+  KERNEL(breadth_first)            \
+  KERNEL(counting_sort)            \
+  KERNEL(mesh_edges)               \
+  KERNEL(outer_faces)              \
+  KERNEL(column_sum)               \
+  KERNEL(orthogonalize)            \
+  KERNEL(mlp)                      \
   KERNEL(mlp_backward)
 
 /* dispatch.c: the table of an instruction set by name ("base", "avx2", "avx512"), or of the best one if name is NULL.

@@ -412,20 +412,39 @@ KERNEL(mlp_backward, dout, MLP, MLP_KEPT, dx, dbeside, dweight1, dbias1, dweight
   gamma, beta, context_gamma, context_beta, query, key_value, weight, bias, inner_gamma, inner_beta, first, \
       first_bias, second, second_bias
 
-KERNEL(attention_block, BLOCK_ROWS, BLOCK_WEIGHTS, heads, out) {
-  const int64_t H = a->heads.integer;
-  const ast_attention_block s = {EACH(SIZE, B, Q, K, W, C, F), .H = H, .D = n['I'] / H, EACH(FIELD, BLOCK_ROWS),
-                                 EACH(FIELD, BLOCK_WEIGHTS)};
-  return kernels->attention_block(&s, a->out.data);
+#define BLOCK_KEPT queries, keys_values, mixed, maximum, total, y, z, hidden
+PARAMETERS(block_inputs, BLOCK_ROWS, BLOCK_WEIGHTS);
+
+static ast_attention_block block_of(const void *arguments, const int64_t *n) {
+  const block_inputs_arguments *a = arguments;
+  return (ast_attention_block){EACH(SIZE, B, Q, K, W, C, F, H), .D = n['I'] / n['H'], EACH(FIELD, BLOCK_ROWS),
+                               EACH(FIELD, BLOCK_WEIGHTS)};
 }
 
-static bool attention_block_check(const call *c) {
-  const attention_block_arguments *a = (const void *)c->arguments;
-  const int64_t I = c->size['I'], H = a->heads.integer, D = I / H;
+KERNEL(attention_block, BLOCK_ROWS, BLOCK_WEIGHTS, heads, out, BLOCK_KEPT) {
+  const ast_attention_block s = block_of(a, n);
+  return kernels->attention_block(&s, a->out.data, (ast_attention_block_kept){EACH(FIELD, BLOCK_KEPT)});
+}
+
+KERNEL(attention_block_backward, dout, BLOCK_ROWS, BLOCK_WEIGHTS, heads, BLOCK_KEPT, dx, dcontext, dgamma, dbeta,
+       dcontext_gamma, dcontext_beta, dquery, dkey_value, dweight, dbias, dinner_gamma, dinner_beta, dfirst,
+       dfirst_bias, dsecond, dsecond_bias) {
+  const ast_attention_block s = block_of(&a->x, n);
+  return kernels->attention_block_backward(
+      &s, a->dout.data, (ast_attention_block_kept){EACH(FIELD, BLOCK_KEPT)},
+      (ast_attention_block_gradients){EACH(GRADIENT, x, context), EACH(GRADIENT, BLOCK_WEIGHTS)});
+}
+
+static bool block_check(const call *c, const void *arguments) {
+  const block_inputs_arguments *a = arguments;
+  const int64_t I = c->size['I'], H = c->size['H'], D = H ? I / H : 0;
   const bool rotated = a->rotations.data || a->context_rotations.data;
-  return (I % H == 0 && D % 16 == 0 && D >= 16 && D <= 128 && (!rotated || c->size['E'] == D)) ||
+  return (H && I % H == 0 && D % 16 == 0 && D >= 16 && D <= 128 && (!rotated || c->size['E'] == D)) ||
          fail(c, "the head dimension must be a multiple of 16 up to 128, and the dimension of the rotations");
 }
+
+static bool attention_block_check(const call *c) { return block_check(c, c->arguments); }
+static bool attention_block_backward_check(const call *c) { return block_check(c, c->arguments + 1); }
 
 /* ---- all kernels ---- */
 
@@ -446,6 +465,7 @@ static binding bindings[] = {
     BINDING(attention, .check = attention_check),
     BINDING(attention_backward, .check = attention_check),
     BINDING(attention_block, .check = attention_block_check),
+    BINDING(attention_block_backward, .check = attention_block_backward_check),
     BINDING(attention_kv, .check = attention_check),
     BINDING(attention_kv_backward, .check = attention_check),
     BINDING(attention_qkv, .check = attention_check),

@@ -15,7 +15,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-enum { MAX_PARAMETERS = 28, MAX_CHECKS = 2, NO_PARAMETER = -1, LETTERS = 'Z' + 1 };
+enum { MAX_PARAMETERS = 48, MAX_CHECKS = 2, NO_PARAMETER = -1, LETTERS = 'Z' + 1 };
 enum { ARRAY, INTEGER, NUMBER, BITS }; /* kinds */
 
 /* All of these are numbers of 64 bits, in the order in which they come from Python. */

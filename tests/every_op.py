@@ -168,7 +168,6 @@ def dropout_results(scenes: Sequence[int]) -> Results:
 
 
 def block_results(scenes: Sequence[int]) -> Results:
-    """Without gradients: the composition gives them."""
     keys = [90, 300, 7, 40, 600]
     q_offsets, k_offsets = offsets_of(scenes), offsets_of(scenes, keys)
     turns = (rows(scenes, 16, key=3), rows(scenes, 16, key=4, sizes=keys))
@@ -184,8 +183,12 @@ def block_results(scenes: Sequence[int]) -> Results:
     ]
     weights += [shared(40), shared(40), shared(66, 40), shared(66), shared(40, 33), shared(40)]
     vectors = (rows(scenes, 40, key=1), rows(scenes, 24, key=2, sizes=keys))
-    out = attention_block(*vectors, *turns, q_offsets, k_offsets, weights, 2)
-    return [[x] for x in split(out, q_offsets)], []
+    return differentiated(
+        lambda x, context, *weights: attention_block(x, context, *turns, q_offsets, k_offsets, weights, 2),
+        (*vectors, *weights),
+        [q_offsets, k_offsets],
+        q_offsets,
+    )
 
 
 def edges_of(scenes: Sequence[int]) -> EdgeSet:

@@ -1,5 +1,5 @@
-"""Attention within each scene of a batch, without a score matrix in memory; and a whole attention block, for where
-no gradient is wanted: one call instead of a dozen.
+"""Attention within each scene of a batch, without a score matrix in memory; and a whole attention block: one call
+instead of a dozen.
 
 Legend: B scenes, T tokens (Tq queries, Tk keys), H heads, D channels of a head. In a block, Q vectors of width W attend
 to K vectors of width C, I = H D, and the feed-forward part has F hidden units.
@@ -14,9 +14,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from ast_sim.ops._linear import SAVED
 from ast_sim.ops._mlp import layer_norm
-from ast_sim.ops.derivatives import differentiate_by_composition, gradient_op
-from ast_sim.ops.library import Kernel, Op
+from ast_sim.ops.derivatives import gradient_op
+from ast_sim.ops.library import Kernel, Op, is_at_most
 from ast_sim.ops.spec import Given, Sizes
 
 # ---- dropout: the generator of the C core in torch ----
@@ -202,20 +203,37 @@ def self_attention(qkv: Tensor, offsets: Tensor, dropout_p: float = 0.0, seed: i
 
 # ---- the block ----
 
-_BLOCK_SPEC = (
+_BLOCK_PARAMETERS = (
+    "gamma, beta, context_gamma, context_beta, query, key_value, weight, bias, inner_gamma, inner_beta, first,"
+    " first_bias, second, second_bias"
+)
+_BLOCK_INPUTS = (
     "x[Q,W], context[K,C], rotations?[Q,E], context_rotations?[K,E], q_offsets[B+1] offsets(Q),"
     " k_offsets[B+1] offsets(K), gamma[W], beta[W], context_gamma[C], context_beta[C], query[I,W] filled,"
     " key_value[2I,C] filled, weight[W,I], bias[W], inner_gamma[W], inner_beta[W], first[2F,W] filled, first_bias[2F],"
-    " second[W,F], second_bias[W], heads integer(1,1024) -> out[Q,W]"
+    " second[W,F], second_bias[W], heads size(H)"
+)
+_BLOCK_SPEC = (
+    f"{_BLOCK_INPUTS}; save switch, save_z switch -> out[Q,W], queries[Q,I] if(save), keys_values[K,2I] if(save),"
+    " mixed[Q,I] if(save), maximum[Q,H] if(save), total[Q,H] if(save), y[Q,W] if(save), z[Q,2F] if(save_z),"
+    " hidden[Q,F] if(save)"
+)
+_BLOCK_BACKWARD_SPEC = (
+    f"dout[Q,W] late, {_BLOCK_INPUTS}, queries[Q,I], keys_values[K,2I], mixed[Q,I], maximum[Q,H], total[Q,H], y[Q,W],"
+    f" z?[Q,2F], hidden[Q,F]; wanted wants(x,context,{_BLOCK_PARAMETERS.replace(' ', '')}) -> dx[Q,W] if(wanted),"
+    " dcontext[K,C] if(wanted), dgamma[W] if(wanted), dbeta[W] if(wanted), dcontext_gamma[C] if(wanted),"
+    " dcontext_beta[C] if(wanted), dquery[I,W] if(wanted), dkey_value[2I,C] if(wanted), dweight[W,I] if(wanted),"
+    " dbias[W] if(wanted), dinner_gamma[W] if(wanted), dinner_beta[W] if(wanted), dfirst[2F,W] if(wanted),"
+    " dfirst_bias[2F] if(wanted), dsecond[W,F] if(wanted), dsecond_bias[W] if(wanted)"
 )
 
 
 def _check_block_heads(name: str, sizes: Sizes, given: Given) -> None:
-    width, rest = divmod(sizes["I"], given["heads"])
+    width, rest = divmod(sizes["I"], sizes["H"]) if sizes["H"] else (0, 1)
     if rest or width % 16 or not 16 <= width <= 128 or sizes.get("E", width) != width:
         raise ValueError(
             f"{name}: the head dimension must be a multiple of 16 up to 128, and equal to the one of the rotations, not"
-            f" {sizes['I'] / given['heads']:g} and {sizes.get('E', 'none')}"
+            f" {sizes['I']} / {sizes['H']} and {sizes.get('E', 'none')}"
         )
 
 
@@ -233,20 +251,26 @@ def _turned(x: Tensor, rotations: Tensor | None) -> Tensor:
 
 def _block_reference(
     x, context, rotations, context_rotations, q_offsets, k_offsets, gamma, beta, context_gamma, context_beta, query,
-    key_value, weight, bias, inner_gamma, inner_beta, first, first_bias, second, second_bias, heads,
+    key_value, weight, bias, inner_gamma, inner_beta, first, first_bias, second, second_bias, heads, save, save_z,
 ):  # fmt: skip
     q = F.linear(layer_norm(x, gamma, beta), query).unflatten(1, (heads, -1))
     of_context = F.linear(layer_norm(context, context_gamma, context_beta), key_value)
     k, v = of_context.unflatten(1, (2, heads, -1)).unbind(1)
     q, k = _turned(q, rotations), _turned(k, context_rotations)
-    mixed = _reference(q, k, v, q_offsets, k_offsets, q.shape[-1] ** -0.5, 0.0, 0)[0]
+    mixed, maximum, total = _reference(q, k, v, q_offsets, k_offsets, q.shape[-1] ** -0.5, 0.0, 0)
     y = x + F.linear(mixed.flatten(1), weight, bias)
-    a, b = F.linear(layer_norm(y, inner_gamma, inner_beta), first, first_bias).chunk(2, dim=1)
-    return y + F.linear(a * F.gelu(b), second, second_bias)
+    z = F.linear(layer_norm(y, inner_gamma, inner_beta), first, first_bias)
+    a, b = z.chunk(2, dim=1)
+    hidden = a * F.gelu(b)
+    out = y + F.linear(hidden, second, second_bias)
+    if not save:
+        return out, *[None] * 6, z if save_z else None, None
+    keys_values = torch.cat([k.flatten(1), v.flatten(1)], dim=1)
+    return out, q.flatten(1), keys_values, mixed.flatten(1), maximum, total, y, z if save_z else None, hidden
 
 
 _block = Op(Kernel("attention_block", _BLOCK_SPEC, _check_block_heads), _block_reference)
-differentiate_by_composition(_block)
+_block_backward = gradient_op(_block, Kernel("attention_block_backward", _BLOCK_BACKWARD_SPEC, _check_block_heads))
 
 
 def attention_block(
@@ -264,7 +288,8 @@ def attention_block(
     q = W_q LN(x), [k, v] = W_kv LN_c(context), y = x + W_o attention(rotated q, rotated k, v) + b_o,
     [a, b] = W_1 LN_f(y) + b_1, out = y + W_2 (a gelu(b)) + b_2.
 
-    A row of the result depends only on the scene of that row, bit for bit.
+    A row of the result depends only on the scene of that row, bit for bit. The gradients have the same bits for any
+    number of threads. If a rotation has a gradient, the composition gives all of them, and stores the scores.
 
     Args:
         x, context: [Q, W] and [K, C].
@@ -281,4 +306,10 @@ def attention_block(
     Raises:
         ValueError: shapes, offsets or heads are not as above.
     """
-    return _block(x, context, rotations, context_rotations, q_offsets, k_offsets, *parameters, heads)
+    given = (x, context, rotations, context_rotations, q_offsets, k_offsets, *parameters, heads)
+    if torch.is_grad_enabled() and any(
+        turn is not None and turn.requires_grad for turn in (rotations, context_rotations)
+    ):
+        return _block.compose(*given, False, False)[0]
+    save = torch.is_grad_enabled() and any(y.requires_grad for y in (x, context, *parameters))
+    return _block(*given, save, save and is_at_most(len(x) * len(parameters[11]), SAVED))[0]

@@ -52,7 +52,7 @@ static void check_accuracy(const char *what, const float *got, const double *exa
 
 /* What the formula gives for a problem, in double and in float. Every table is posed the same problems, and the formula
  * takes most of the time of a test, so the latest results are kept, under the bits of all that makes a problem. */
-enum { MOST_RESULTS = 12, MOST_KEPT = 1024 };
+enum { MOST_RESULTS = 17, MOST_KEPT = 1024 };
 typedef struct {
   uint64_t key;
   double *exact[MOST_RESULTS];

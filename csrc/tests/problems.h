@@ -224,4 +224,54 @@ static ast_attention_block new_block(int64_t *q_offsets, int64_t *k_offsets, int
       (s).context_gamma, (s).context_beta, (s).query, (s).key_value, (s).weight, (s).bias, (s).inner_gamma,    \
       (s).inner_beta, (s).first, (s).first_bias, (s).second, (s).second_bias
 
+enum { BLOCK_RESULTS = 17, BLOCK_KEPT = 8 };
+static const char *const block_names[BLOCK_RESULTS] = {
+    "out",           "dx",     "dcontext",    "dgamma",  "dbeta",       "dcontext_gamma",
+    "dcontext_beta", "dquery", "dkey_value",  "dweight", "dbias",       "dinner_gamma",
+    "dinner_beta",   "dfirst", "dfirst_bias", "dsecond", "dsecond_bias"};
+
+/* out, and the gradients in the order of the struct; and what is kept between. */
+typedef struct {
+  int64_t size[BLOCK_RESULTS];
+  float *of[BLOCK_RESULTS];
+  ast_attention_block_kept kept;
+  ast_attention_block_gradients gradients;
+} block_results;
+_Static_assert(sizeof(ast_attention_block_gradients) == (BLOCK_RESULTS - 1) * sizeof(float *), "one each");
+
+static block_results new_block_results(const ast_attention_block *s, bool keep_z) {
+  const int64_t queries = s->Q, K = s->K, W = s->W, C = s->C, F = s->F, I = s->H * s->D;
+  block_results r = {.size = {queries * W, queries * W, K * C, W, W, C, C, I * W, 2 * I * C, W * I, W, W, W, 2 * F * W,
+                              2 * F, W * F, W}};
+  for (int i = 0; i < BLOCK_RESULTS; i++) r.of[i] = new_floats(r.size[i]);
+  memcpy(&r.gradients, r.of + 1, sizeof r.gradients);
+  r.kept = (ast_attention_block_kept){new_floats(queries * I),
+                                      new_floats(K * 2 * I),
+                                      new_floats(queries * I),
+                                      new_floats(queries * s->H),
+                                      new_floats(queries * s->H),
+                                      new_floats(queries * W),
+                                      keep_z ? new_floats(queries * 2 * F) : NULL,
+                                      new_floats(queries * F)};
+  return r;
+}
+#define KEPT_BUFFERS(k) (k).queries, (k).keys_values, (k).mixed, (k).maximum, (k).total, (k).y, (k).z, (k).hidden
+
+/* Both directions. */
+static block_results solve_block(const ast_kernels *kernels, const ast_attention_block *s, const float *dout,
+                                 bool keep_z) {
+  const block_results r = new_block_results(s, keep_z);
+  READ_ONLY(BLOCK_BUFFERS(*s), dout);
+  CHECK(kernels->attention_block(s, r.of[0], r.kept) == AST_OK, "status");
+  READ_ONLY(KEPT_BUFFERS(r.kept));
+  CHECK(kernels->attention_block_backward(s, dout, r.kept, r.gradients) == AST_OK, "status");
+  WRITABLE(BLOCK_BUFFERS(*s), dout);
+  WRITABLE(KEPT_BUFFERS(r.kept));
+  return r;
+}
+static void free_block_results(block_results r) {
+  for (int i = 0; i < BLOCK_RESULTS; i++) FREE(r.of[i]);
+  FREE(KEPT_BUFFERS(r.kept));
+}
+
 #endif

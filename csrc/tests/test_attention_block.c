@@ -1,4 +1,4 @@
-/* attention_block against the formula in double, on every instruction set, serial and on a pool.
+/* attention_block and attention_block_backward against the formula in double, on every instruction set, serial and on a pool.
  *
 * Accuracy: the largest error is at most twice the error of the formula in plain float plus 1e-6 of the largest value.
  */
@@ -11,10 +11,12 @@
 #define FORMULA formula_float
 #include "formula_attention_block.h"
 
+static const ast_attention_block_kept nothing;
+
 static float *solve(const ast_kernels *kernels, const ast_attention_block *s) {
   float *out = new_floats(s->Q * s->W);
   READ_ONLY(BLOCK_BUFFERS(*s));
-  CHECK(kernels->attention_block(s, out) == AST_OK, "status");
+  CHECK(kernels->attention_block(s, out, nothing) == AST_OK, "status");
   WRITABLE(BLOCK_BUFFERS(*s));
   return out;
 }
@@ -37,14 +39,17 @@ static void test_accuracy(const ast_kernels *kernels) {
       const int64_t *n = sizes[i];
       const ast_attention_block s = new_block(offsets_of(n[0], n[1], n[2]), offsets_of(n[0], n[3], n[4]), n[0], n[5],
                                               n[6], n[7], n[8], n[9], rotated, random_floats);
-      float *out = solve(kernels, &s);
-      const int64_t size = s.Q * s.W;
+      float *dout = random_floats(s.Q * s.W), *out = solve(kernels, &s);
+      const block_results r = solve_block(kernels, &s, dout, i % 2);
+      CHECK(memcmp(out, r.of[0], (size_t)r.size[0] * sizeof *out) == 0, "what is kept changes the result");
       bool fresh;
-      uint64_t key = add_to_key((uint64_t)(2 * i) + (uint64_t)rotated, s.x, size * (int64_t)sizeof *out);
-      const formula_results *f = results_of(key, &size, 1, &fresh);
-      if (fresh) formula(&s, f->exact[0]), formula_float(&s, f->plain[0]);
-      check_accuracy("out", out, f->exact[0], f->plain[0], size);
-      FREE(BLOCK_BUFFERS(s), out);
+      uint64_t key = add_to_key((uint64_t)(2 * i) + (uint64_t)rotated, s.x, r.size[0] * (int64_t)sizeof *out);
+      const formula_results *f = results_of(key, r.size, BLOCK_RESULTS, &fresh);
+      if (fresh) formula(&s, dout, f->exact), formula_float(&s, dout, f->plain);
+      for (int k = 0; k < BLOCK_RESULTS; k++)
+        check_accuracy(block_names[k], r.of[k], f->exact[k], f->plain[k], r.size[k]);
+      FREE(BLOCK_BUFFERS(s), dout, out);
+      free_block_results(r);
     }
 }
 
@@ -53,13 +58,16 @@ static void test_same_bits(const ast_kernels *kernels) {
   enum { FIRST = 300, SECOND = 150, KEYS_1 = 40, KEYS_2 = 210, W = 40, C = 30, D = 16 };
   ast_attention_block s =
       new_block(offsets_of(2, FIRST, SECOND), offsets_of(2, KEYS_1, KEYS_2), 2, W, C, 2, D, 24, true, random_floats);
-  float *out = solve(kernels, &s);
+  float *out = solve(kernels, &s), *dout = random_floats((FIRST + SECOND) * W);
+  const block_results all = solve_block(kernels, &s, dout, true);
   if (ast_threads() > 1) {
     ast_set_pool(NULL, NULL);
-    float *serial = solve(kernels, &s);
+    const block_results serial = solve_block(kernels, &s, dout, true);
     ast_set_pool(pool_for, pool_threads);
-    CHECK(memcmp(serial, out, (FIRST + SECOND) * W * sizeof *out) == 0, "threads change the result");
-    FREE(serial);
+    for (int k = 0; k < BLOCK_RESULTS; k++)
+      CHECK(memcmp(serial.of[k], all.of[k], (size_t)all.size[k] * sizeof *out) == 0, "threads change %s",
+            block_names[k]);
+    free_block_results(serial);
   }
   ast_attention_block alone = s;
   alone.B = 1, alone.Q = SECOND, alone.K = KEYS_2;
@@ -67,13 +75,19 @@ static void test_same_bits(const ast_kernels *kernels) {
   alone.x += FIRST * W, alone.context += KEYS_1 * C, alone.rotations += FIRST * D,
       alone.context_rotations += KEYS_1 * D;
   float *part = new_floats(SECOND * W);
-  CHECK(kernels->attention_block(&alone, part) == AST_OK, "status");
+  CHECK(kernels->attention_block(&alone, part, nothing) == AST_OK, "status");
   CHECK(memcmp(part, out + FIRST * W, SECOND * W * sizeof *out) == 0, "a scene alone differs");
+  const block_results own = new_block_results(&alone, true);
+  CHECK(kernels->attention_block(&alone, own.of[0], own.kept) == AST_OK, "status");
+  CHECK(kernels->attention_block_backward(&alone, dout + FIRST * W, own.kept, own.gradients) == AST_OK, "status");
+  CHECK(memcmp(own.of[1], all.of[1] + FIRST * W, SECOND * W * sizeof *out) == 0, "dx of a scene alone differs");
+  CHECK(memcmp(own.of[2], all.of[2] + KEYS_1 * C, KEYS_2 * C * sizeof *out) == 0, "dcontext of a scene alone differs");
   ((float *)s.context)[0] = NAN;
   float *beside = solve(kernels, &s);
   CHECK(memcmp(part, beside + FIRST * W, SECOND * W * sizeof *out) == 0, "a NaN reaches another scene");
   for (int64_t i = 0; i < FIRST * W; i++) CHECK(isnan(beside[i]), "a NaN is lost");
-  FREE(BLOCK_BUFFERS(s), alone.q_offsets, alone.k_offsets, out, part, beside);
+  FREE(BLOCK_BUFFERS(s), alone.q_offsets, alone.k_offsets, out, dout, part, beside);
+  free_block_results(all), free_block_results(own);
 }
 
 static void test(const ast_kernels *kernels) {

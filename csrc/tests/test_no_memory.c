@@ -209,7 +209,18 @@ static outcome attention_block(const ast_kernels *kernels) {
   const ast_attention_block s = new_block(even_offsets(SCENES, QUERIES), even_offsets(SCENES, KEYS), SCENES, 40, 30, H,
                                           D, 24, true, random_floats);
   float *out = new_floats(s.Q * s.W);
-  return FINISH(KERNEL(kernels->attention_block(&s, out)), out);
+  return FINISH(KERNEL(kernels->attention_block(&s, out, (ast_attention_block_kept){0})), out);
+}
+
+static outcome attention_block_backward(const ast_kernels *kernels) {
+  const ast_attention_block s = new_block(even_offsets(SCENES, QUERIES), even_offsets(SCENES, KEYS), SCENES, 40, 30, H,
+                                          D, 24, true, random_floats);
+  const float *dout = random_floats(s.Q * s.W);
+  const block_results r = new_block_results(&s, false);
+  CHECK(kernels->attention_block(&s, r.of[0], r.kept) == AST_OK, "status");
+  const void *outputs[BLOCK_RESULTS - 1];
+  memcpy(outputs, r.of + 1, sizeof outputs);
+  return finish(KERNEL(kernels->attention_block_backward(&s, dout, r.kept, r.gradients)), outputs, BLOCK_RESULTS - 1);
 }
 
 static ast_message message_case(void) { return new_message(6000, 3000, 3000, 3, 16, 24, 20, 1); }
@@ -377,6 +388,7 @@ static const struct {
     {"attention", attention},
     {"attention_backward", attention_backward},
     {"attention_block", attention_block},
+    {"attention_block_backward", attention_block_backward},
     {"message", message},
     {"message_backward", message_backward},
     {"linear", linear},

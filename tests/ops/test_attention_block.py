@@ -29,11 +29,42 @@ def fused(*given: Tensor | None) -> Tensor:
     return attention_block(*given[:6], given[6:], HEADS)
 
 
+def composed(*given: Tensor | None) -> Tensor:
+    return ops._block_reference(*given, HEADS, False, False)[0]
+
+
 @pytest.mark.parametrize("rotated", [True, False])
 @pytest.mark.parametrize("sizes", [([1], [1]), ([130, 0, 5], [7, 9, 300]), ([3, 4], [0, 5])])
-def test_accuracy(sizes, rotated):
-    inputs = case(*sizes, 40, 24, rotated)
-    assert_accurate(fused, lambda *given: ops._block_reference(*given, HEADS), inputs)
+def test_accuracy(sizes, rotated, monkeypatch):
+    """Of the vectors and of all gradients but those of the rotations, which no kernel has; with and without the inputs
+    of GEGLU kept between."""
+    x, context, *turns, q_offsets, k_offsets, _ = (inputs := case(*sizes, 40, 24, rotated))[:7]
+
+    def turned(function):
+        def of_others(x, context, *parameters):
+            rotations = [None if turn is None else turn.to(x.dtype) for turn in turns]
+            return function(x, context, *rotations, q_offsets, k_offsets, *parameters)
+
+        return of_others
+
+    for most in (ops.SAVED, 0):
+        monkeypatch.setattr(ops, "SAVED", most)
+        assert_accurate(turned(fused), turned(composed), [x, context, *inputs[6:]])
+
+
+def test_rotations_have_a_gradient_by_the_composition():
+    inputs = case([5, 6], [7, 8], 40, 24)
+    assert_accurate(fused, composed, inputs)
+
+
+def test_only_wanted_gradients_are_made():
+    inputs = case([5, 6], [7, 8], 40, 24)
+    for place in (0, 10, 19):
+        given = list(inputs)
+        given[place] = inputs[place].clone().requires_grad_()
+        every = [x.clone().requires_grad_() if i in (0, 1) or i > 5 else x for i, x in enumerate(inputs)]
+        (one,) = torch.autograd.grad(fused(*given).square().sum(), given[place])
+        assert torch.equal(one, torch.autograd.grad(fused(*every).square().sum(), every[place])[0])
 
 
 def test_no_vectors():
@@ -45,7 +76,7 @@ def test_vectors_that_attend_to_themselves_and_slices_of_a_weight():
     together = torch.cat([weights[4], weights[5]])
     query, key_value = together.split((HEADS * WIDTH, 2 * HEADS * WIDTH))
     given = (x, x, turns, turns, offsets, offsets, *weights[:4], query, key_value, *weights[6:])
-    torch.testing.assert_close(fused(*given), ops._block_reference(*given, HEADS), rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(fused(*given), composed(*given), rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize(

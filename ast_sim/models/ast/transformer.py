@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from ast_sim.models.ast.ast_config import ASTConfig
 from ast_sim.models.layers import Linear
 from ast_sim.ops import attention_block, cross_attention, rotated, self_attention
+from ast_sim.ops.library import is_differentiated
 
 
 class Vectors(NamedTuple):
@@ -72,14 +73,15 @@ class AttentionBlock(nn.Module):
     def forward(self, vectors: Vectors, context: Vectors | None = None) -> Vectors:
         """The vectors after they have attended to the context, or without one to themselves."""
         dropout = self.dropout if self.training else 0.0
-        if not dropout and not torch.is_grad_enabled():
+        turned = [x.rotations for x in (vectors, context) if x is not None and x.rotations is not None]
+        if not dropout and not any(map(is_differentiated, turned)):
             return vectors._replace(x=self._at_once(vectors, context or vectors))
         options = {"dropout_p": dropout, "seed": int(torch.randint(2**62, (1,))) if dropout else 0}
         mixed = self._among(vectors, options) if context is None else self._to(context, vectors, options)
         return vectors._replace(x=self.feed_forward(self.out(mixed.flatten(1), residual=vectors.x)))
 
     def _at_once(self, vectors: Vectors, context: Vectors) -> Tensor:
-        """[T, width]: the same where no gradient is wanted, in one call."""
+        """[T, width]: the same in one call, which has neither dropout nor a gradient by the rotations."""
         if vectors is context:
             norm_context, inner = self.norm, self.query_key_value.out_features // 3
             query, key_value = self.query_key_value.weight.split((inner, 2 * inner))
