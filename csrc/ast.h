@@ -139,8 +139,8 @@ typedef struct {
   const char *isa;
   int vector_bytes;
 
-  /* out[c] = sum (or mean) of x[node_order[j]] for node_offsets[c] <= j < node_offsets[c+1], in that order; 0 if empty.
-   * x [N,F], node_order [node_offsets[C]], out [C,F]. */
+  /* out[c] = sum (or mean) of x[node_order[j]] for node_offsets[c] <= j < node_offsets[c+1], in that order by chains of
+   * 256 rows, whose sums are added by halves; 0 if empty. x [N,F], node_order [node_offsets[C]], out [C,F]. */
   ast_status (*segment_sum)(const float *restrict x, int64_t F, const int64_t *restrict node_order,
                             const int64_t *restrict node_offsets, int64_t C, bool mean, float *restrict out);
   /* The adjoint: dx[node_order[j]] = dout[c] (over the number of rows of c if mean). node_order is a permutation of
@@ -203,7 +203,7 @@ typedef struct {
   /* The block's vectors, out [Q,W], without dropout. D is a multiple of 16 up to 128. */
   ast_status (*attention_block)(const ast_attention_block *s, float *restrict out);
 
-  /* sum[r] = sum over the edges m into r, in stored order, of messages[m] = LN(W2 relu(z_m) + b2; gamma, beta), where
+  /* sum[r] = sum over the edges m into r, in stored order by chains of 256, of messages[m] = LN(W2 relu(z_m) + b2; gamma, beta), where
    * z_m = of_senders[s] + of_receivers[r] + A2 relu(A1 e_m + a1), or + e_m without an encoder; 0 without edges.
    * sum [R,F2]; messages [M,F2] or NULL. */
   ast_status (*message)(const ast_message *s, float *restrict sum, float *restrict messages);
@@ -221,7 +221,7 @@ typedef struct {
                                 const float *restrict weight, const float *restrict bias, const float *restrict z,
                                 float *restrict dx, float *restrict dweight, float *restrict dbias);
   /* force [N,3] = -dE/dposition of the energy E = sum_e V (lambda/2 tr(G)^2 + mu G:G), G = (F^T F - I) / 2, added at
-   * each node in the order of node_order. An element contributes exactly nothing, whatever its positions, if its Lame
+   * each node in the order of node_order, by chains of 256 whose sums are added by halves. An element contributes exactly nothing, whatever its positions, if its Lame
    * constants are both 0, a rest position is not finite, or its rest volume is no more than rounding. */
   ast_status (*elastic_forces)(const ast_elastic *s, float *restrict force);
   /* dposition [N,3] = (dforce/dposition) dforce, whose matrix is symmetric: the gradient. */

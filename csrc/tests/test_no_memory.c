@@ -98,8 +98,9 @@ static int64_t *even_offsets(int64_t num, int64_t step) {
 }
 
 static outcome segment(const ast_kernels *kernels, bool spread) {
-  enum { F = 131, C = 300, N = 3 * C };
+  enum { F = 131, C = 300, LONG = 600, N = 3 * C + LONG };
   int64_t *offsets = even_offsets(C, 3), *order = even_offsets(N - 1, 1);
+  offsets[C] += LONG; /* rows of more than one chain */
   float *x = random_floats((spread ? C : N) * F), *out = new_floats((spread ? N : C) * F);
   return FINISH(KERNEL((spread ? kernels->segment_spread : kernels->segment_sum)(x, F, order, offsets, C, true, out)),
                 out);
