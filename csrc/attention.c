@@ -60,7 +60,8 @@ typedef struct {
   float keys[KEYS * ROW], values[KEYS * ROW];
   float scores[KEYS * ROW];
   dropout_words words[2];
-  float queries[QUERIES * MAX_D]; /* scale Q in panels */
+  float queries[QUERIES * MAX_D]; /* scale Q in panels, */
+  float scale;                    /* or Q and the scale of its scores, which is 1 otherwise */
   float out[QUERIES * ROW], maximum[QUERIES], sum[QUERIES], unit;
 } forward_scratch;
 
@@ -100,6 +101,18 @@ AST_INLINE void dropped_weights(float *x, int64_t n, const vf base[2], int32_t s
   }
 }
 
+/* Scores of n keys times a factor, and their maximum. */
+static __attribute__((noinline)) void scale_scores(int64_t n, float factor, float *x, vf largest[2]) {
+  EACH(2, c) largest[c] = vsplat(-INFINITY);
+  for (int64_t j = 0; j < n; j++) {
+    EACH(2, c) {
+      const vf scaled = factor * vload(x + j * ROW + c * VW);
+      vstore(x + j * ROW + c * VW, scaled);
+      largest[c] = vmax(scaled, largest[c]);
+    }
+  }
+}
+
 /* Takes n keys, k0 the first of them in the scene, into the state of a panel, the queries i0..i0+rows of the task. */
 static void forward_panel(forward_scratch *t, const forward_state *state, int64_t i0, int64_t rows, int64_t query,
                           int64_t k0, int64_t n, int64_t D, int32_t shift, bool first, const dropout *d) {
@@ -107,6 +120,7 @@ static void forward_panel(forward_scratch *t, const forward_state *state, int64_
   const float *queries = t->queries + i0 * D;
   vf largest[2] = {vsplat(-INFINITY), vsplat(-INFINITY)}, base[2], sum[2] = {{0}};
   scores_product(round_up(n, ROW_STEP), D, t->keys, queries, t->scores, largest);
+  if (t->scale != 1) scale_scores(n, t->scale, t->scores, largest);
   EACH(2, c) {
     const vf before = vload(m + c * VW), now = vmax(largest[c], before);
     base[c] = vselect(now == -INFINITY, (vf){0}, now); /* only -inf so far: weights 0, not NaN */
@@ -219,8 +233,9 @@ static ast_status forward_task(int64_t index, void *context) {
   const dropout d = dropout_of(s, task.b, h);
   const int64_t panels = divide_up(rows, LANES), share = divide_up(KEYS, panels);
   for (int64_t p = 0; p < panels; p++)
-    pack_panel(job->q + (q0 + p * LANES) * s->q_stride + h * D, s->q_stride, rows - p * LANES, D, s->scale,
-               t->queries + p * LANES * D);
+    pack_panel(job->q + (q0 + p * LANES) * s->q_stride + h * D, s->q_stride, rows - p * LANES, D,
+               attention_scale_of_queries(s->scale), t->queries + p * LANES * D);
+  t->scale = attention_scale_of_scores(s->scale);
   fill_rows(0, 0, 1, panels * LANES, state.sum);
   fill_rows(-INFINITY, 0, 1, panels * LANES, state.maximum);
   *state.unit = ldexpf(1, -LIFT);

@@ -67,7 +67,8 @@ typedef struct {
       value_panels[KEYS * MAX_D]; /* K by rows and in panels, gain V in panels */
   float dk[KEYS * ROW], dv[KEYS * ROW];
   float weights[SQUARE * ROW], dscores[SQUARE * ROW];             /* P . keep and dS as [query][key] */
-  float queries[CHUNK * ROW], dout[CHUNK * ROW], dq[CHUNK * ROW]; /* scale Q, y and dQ / scale */
+  float queries[CHUNK * ROW], dout[CHUNK * ROW], dq[CHUNK * ROW]; /* scale Q, y and dQ / scale; or */
+  float scale; /* Q and the scale of its scores, which is 1 otherwise */
   dropout_row words[GROUP];
   float maximum[CHUNK], share[CHUNK], delta[CHUNK]; /* m, 1 / l, rowsum(y . out) */
   backward_peak peaks[CHUNK];
@@ -123,6 +124,7 @@ static void backward_group(backward_scratch *t, int64_t i, int64_t rows, int64_t
   for (int64_t r = 0; r < rows; r++) {
     const vf maximum = vsplat(t->maximum[i + r]), share = vsplat(t->share[i + r]), delta = vsplat(t->delta[i + r]);
     float *x_r = x + r * ROW, *dx_r = dx + r * ROW;
+    for (int64_t c = 0; t->scale != 1 && c < n; c += VW) vstore(x_r + c, t->scale * vload(x_r + c));
     backward_peak *peak = t->share[i + r] > PEAK ? &t->peaks[i + r] : NULL;
     if (peak && peak->key < 0) {
       const int64_t at = find_peak(x_r, n, t->maximum[i + r]);
@@ -138,6 +140,7 @@ static void backward_group(backward_scratch *t, int64_t i, int64_t rows, int64_t
       }
     }
     if (peak) peak->sum += sum_of(dx_r, n);
+    for (int64_t c = 0; t->scale != 1 && c < n; c += VW) vstore(dx_r + c, t->scale * vload(dx_r + c));
   }
 }
 
@@ -150,7 +153,7 @@ static void load_queries(const backward_job *job, const backward_range *range, i
   const int64_t H = s->H, D = s->D, h = range->h, q0 = range->cut->q0 + first;
   const float *q = job->q + q0 * s->q_stride + h * D, *dout = job->dout + (q0 * H + h) * D,
               *out = job->out + (q0 * H + h) * D;
-  copy_rows(q, s->q_stride, rows, D, s->scale, t->queries);
+  copy_rows(q, s->q_stride, rows, D, attention_scale_of_queries(s->scale), t->queries);
   copy_rows(dout, H * D, rows, D, 1, t->dout);
   for (int64_t i = 0; i < rows; i += VW) {
     vf sum = {0}, chain = {0}; /* in the order of the products, so that a weight of 1 leaves dS = 0 */
@@ -294,12 +297,13 @@ static ast_status backward_task(int64_t index, void *context) {
   backward_scratch *t = ast_scratch(sizeof *t);
   if (!t) return AST_NO_MEMORY;
   const dropout d = dropout_of(job->s, r.b, r.h);
+  t->scale = attention_scale_of_scores(job->s->scale);
   for (int64_t i = 0; i < r.queries; i += CHUNK) {
     const int64_t rows = min64(CHUNK, r.queries - i), first = r.first_query + i;
     load_queries(job, &r, first, rows, t);
     for (int64_t k0 = 0; k0 < r.keys; k0 += KEYS)
       backward_block(job, &r, first, rows, r.first_key + k0, min64(KEYS, r.keys - k0), &d, t);
-    put_rows(t->dq, rows, D, job->s->scale, false, r.dq + i * r.dq_stride, r.dq_stride);
+    put_rows(t->dq, rows, D, attention_scale_of_queries(job->s->scale), false, r.dq + i * r.dq_stride, r.dq_stride);
     put_peaks(job, &r, first, rows, t);
   }
   return AST_OK;

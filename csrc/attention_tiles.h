@@ -26,6 +26,11 @@ enum {
   ROW_STEP = 4,         /* products compute rows in multiples of this: 90 keys cost 92 */
 };
 
+/* Queries carry a scale up to 1, so that no product overflows which the scaled one does not; a larger one is left for
+ * the scores, as scale q could overflow where the score does not. */
+AST_INLINE float attention_scale_of_queries(float scale) { return fabsf(scale) > 1 ? 1 : scale; }
+AST_INLINE float attention_scale_of_scores(float scale) { return fabsf(scale) > 1 ? scale : 1; }
+
 /* ---- register tiles ---- */
 
 /* x[row][lane] = (x[row][lane] +) a[row] . b[lane] over D channels for a tile of rows; raises largest[2], unless NULL,
