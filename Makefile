@@ -149,7 +149,7 @@ COMPILE_gcc11 := gcc-11 $(C_FLAGS) $(GCC_WARNINGS) -O2
 COMPILE_clang := clang $(C_FLAGS) $(WARNINGS) -O2 -DAST_UNFUSED
 COMPILE_aarch64 := aarch64-linux-gnu-gcc $(C_FLAGS) $(GCC_WARNINGS) -O2
 
-CORE := isa_base dispatch parallel memory tests/simd_base
+CORE := isa_base dispatch parallel memory status tests/simd_base
 ifneq ($(X86),)
 CORE_X86 := isa_avx2 isa_avx512
 SIMD_X86 := tests/simd_avx2 tests/simd_avx512

@@ -25,6 +25,9 @@ typedef enum {
   AST_TOO_LARGE,  /* octree_coarsen: more cells than an int32 can number */
 } ast_status;
 
+/* status.c: what it means, in words, for a message; never NULL. */
+const char *ast_status_text(ast_status status);
+
 /* The sizes of one attention: query rows of scene b attend to all key rows of scene b. */
 typedef struct {
   int64_t B, H, D;

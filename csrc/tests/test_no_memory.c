@@ -489,7 +489,18 @@ static void *test_scratch(void *unused) {
   return unused;
 }
 
+/* Each status has words of its own, and what is no status has some, too. */
+static void test_texts(void) {
+  const char *texts[AST_TOO_LARGE + 2];
+  for (int i = 0; i <= AST_TOO_LARGE + 1; i++) {
+    texts[i] = ast_status_text((ast_status)i);
+    CHECK(texts[i] && *texts[i], "status %d has no text", i);
+    for (int j = 0; j < i; j++) CHECK(strcmp(texts[i], texts[j]) != 0, "statuses %d and %d have one text", j, i);
+  }
+}
+
 int main(void) {
+  test_texts();
   pthread_t thread;
   CHECK(!pthread_create(&thread, NULL, test_scratch, NULL) && !pthread_join(thread, NULL), "no thread");
   on_every_table(test);
