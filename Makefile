@@ -12,7 +12,7 @@ C_FUZZERS := $(patsubst csrc/tests/fuzz_%.c,%,$(wildcard csrc/tests/fuzz_*.c))
 C_TEST_HEADERS := $(wildcard csrc/tests/*.h)
 X86 := $(filter x86_64,$(shell uname -m))
 
-.PHONY: demo test check fuzz corpus lint docs bench shipped tools clean
+.PHONY: demo test check fuzz corpus lint docs bench shipped tools install-tools clean
 
 demo: $(VENV)/installed
 	$(BIN)/ast-sim demo
@@ -105,15 +105,20 @@ $(VENV)/benched: $(VENV)/installed
 	$(PIP) --editable '.[simulate,cad,read,tfrecord,view,bench]'
 	touch $@
 
-# System programs that the tests use; installed where this is allowed, otherwise the tests say what is missing. One at a time if not all
-# together: a system that does not know one of them still gets the others.
+# System programs that the tests use: what is missing, and how to get it. Nothing is installed but by `make install-tools`; then one at a time if
+# not all together: a system that does not know one of them still gets the others.
 COMMANDS := chromium valgrind clang gcc-11 $(if $(X86),aarch64-linux-gnu-gcc:gcc-aarch64-linux-gnu qemu-aarch64:qemu-user) ccx:calculix-ccx
-tools:
-	@missing=; for tool in $(COMMANDS); do command -v $${tool%:*} >/dev/null || missing="$$missing $${tool#*:}"; done; \
+FIND_MISSING := missing=; for tool in $(COMMANDS); do command -v $${tool%:*} >/dev/null || missing="$$missing $${tool\#*:}"; done; \
 	ldconfig -p | grep -q libGLU.so.1 || missing="$$missing libglu1-mesa libxft2 libxcursor1 libxinerama1 libxrender1 libxfixes3"; \
 	ls $$(clang -print-resource-dir 2>/dev/null)/lib/linux/*fuzzer* >/dev/null 2>&1 || missing="$$missing libclang-rt-14-dev"; \
-	ls /usr/aarch64-linux-gnu/lib/libc.so.6 >/dev/null 2>&1 || missing="$$missing $(if $(X86),libc6-dev-arm64-cross)"; \
-	if [ -n "$$missing" ]; then \
+	ls /usr/aarch64-linux-gnu/lib/libc.so.6 >/dev/null 2>&1 || missing="$$missing $(if $(X86),libc6-dev-arm64-cross)"
+tools:
+	@$(FIND_MISSING); if [ -n "$$missing" ]; then \
+	  echo "missing:$$missing"; \
+	  echo "the tests that need them will fail; \`make install-tools\` as root gets them: apt-get install$$missing"; \
+	fi
+install-tools:
+	@$(FIND_MISSING); if [ -n "$$missing" ]; then \
 	  echo "installing$$missing"; export DEBIAN_FRONTEND=noninteractive; install="apt-get install -qq -y"; \
 	  apt-get update -qq; $$install $$missing >/dev/null 2>&1 || for package in $$missing; do \
 	    $$install $$package >/dev/null || echo "cannot install $$package: the tests that need it will fail"; \
@@ -144,7 +149,7 @@ COMPILE_gcc11 := gcc-11 $(C_FLAGS) $(GCC_WARNINGS) -O2
 COMPILE_clang := clang $(C_FLAGS) $(WARNINGS) -O2 -DAST_UNFUSED
 COMPILE_aarch64 := aarch64-linux-gnu-gcc $(C_FLAGS) $(GCC_WARNINGS) -O2
 
-CORE := isa_base dispatch parallel memory tests/simd_base
+CORE := isa_base dispatch parallel memory status tests/simd_base
 ifneq ($(X86),)
 CORE_X86 := isa_avx2 isa_avx512
 SIMD_X86 := tests/simd_avx2 tests/simd_avx512

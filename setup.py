@@ -67,7 +67,7 @@ libraries = [
 ]
 extension = Extension(
     "ast_sim._C",
-    sources=["csrc/module.c", "csrc/dispatch.c", "csrc/parallel.c", "csrc/memory.c"],
+    sources=["csrc/module.c", "csrc/dispatch.c", "csrc/parallel.c", "csrc/memory.c", "csrc/status.c"],
     depends=HEADERS + SOURCES,
     include_dirs=[numpy.get_include()],
     define_macros=[(f"AST_HAVE_{isa.upper()}", None) for isa in sets],

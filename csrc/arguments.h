@@ -38,7 +38,7 @@ typedef struct {
 
 enum { UNBOUND = -1 };
 
-static bool fail(const call *c, const char *problem) {
+static bool call_fail(const call *c, const char *problem) {
   PyErr_Format(PyExc_ValueError, "%s: %s", c->spec->name, problem);
   return false;
 }
@@ -52,7 +52,7 @@ static const char *name_of(const call *c, int i) {
   return shown;
 }
 
-static bool refuse(const call *c, int i, PyObject *type, const char *why) {
+static bool call_refuse(const call *c, int i, PyObject *type, const char *why) {
   PyErr_Format(type, "%s: %s %s", c->spec->name, name_of(c, i), why);
   return false;
 }
@@ -111,11 +111,11 @@ static bool take_layout(const parameter *p, const view *v, argument *a) {
 static bool take_array(call *c, int i, PyObject *object) {
   const parameter *p = &c->spec->parameters[i];
   view v;
-  if (!view_of(object, &v)) return refuse(c, i, PyExc_TypeError, "must be a dense tensor on the CPU");
-  if (v.type != p->type) return refuse(c, i, PyExc_ValueError, "is of another type");
-  if (!take_shape(c, p, &v)) return refuse(c, i, PyExc_ValueError, "has another shape");
-  if (p->filled && view_size(&v) == 0) return refuse(c, i, PyExc_ValueError, "has no elements");
-  return take_layout(p, &v, &c->arguments[i]) || refuse(c, i, PyExc_BufferError, "must be aligned and contiguous");
+  if (!view_of(object, &v)) return call_refuse(c, i, PyExc_TypeError, "must be a dense tensor on the CPU");
+  if (v.type != p->type) return call_refuse(c, i, PyExc_ValueError, "is of another type");
+  if (!take_shape(c, p, &v)) return call_refuse(c, i, PyExc_ValueError, "has another shape");
+  if (p->filled && view_size(&v) == 0) return call_refuse(c, i, PyExc_ValueError, "has no elements");
+  return take_layout(p, &v, &c->arguments[i]) || call_refuse(c, i, PyExc_BufferError, "must be aligned and contiguous");
 }
 
 static bool take_number(call *c, int i, PyObject *object) {
@@ -133,7 +133,7 @@ static bool take_number(call *c, int i, PyObject *object) {
   if (p->kind == INTEGER) inside &= a->integer >= p->low && a->integer <= p->high;
   if (p->kind == NUMBER && p->low < p->high) inside &= a->number >= (double)p->low && a->number < (double)p->high;
   if (p->shape[0].letter[0]) c->size[p->shape[0].letter[0]] = a->integer;
-  return inside || refuse(c, i, PyExc_ValueError, "is out of range");
+  return inside || call_refuse(c, i, PyExc_ValueError, "is out of range");
 }
 
 /* ---- values: `a` is the array with the check, `bound` the dimension that the spec names, `others` the arrays ---- */
@@ -231,7 +231,7 @@ static bool secure(argument *a) {
   return true;
 }
 
-static void release(call *c) {
+static void call_release(call *c) {
   for (int i = 0; i < c->spec->num; i++) {
     if (c->arguments[i].frozen) Py_DECREF(c->arguments[i].frozen->owner);
     free(c->arguments[i].secured);
@@ -253,7 +253,7 @@ static bool check_values(const call *c, int at) {
     }
     if (lasts && is_known(a->frozen, &found)) continue;
     if (!checks[check->check](a, found.bound, others))
-      return PyErr_Occurred() ? false : refuse(c, at, PyExc_ValueError, "has other values than its spec says");
+      return PyErr_Occurred() ? false : call_refuse(c, at, PyExc_ValueError, "has other values than its spec says");
     if (lasts) remember(a->frozen, &found);
   }
   return true;
@@ -272,7 +272,7 @@ static void bind_absent(call *c, bool of_inputs) {
     if (c->size[letter] == UNBOUND && (!of_inputs || c->spec->of_inputs[letter])) c->size[letter] = 0;
 }
 
-static bool take(call *c, PyObject *const *objects, Py_ssize_t num) {
+static bool call_take(call *c, PyObject *const *objects, Py_ssize_t num) {
   const spec *s = c->spec;
   const int wanted = s->counts ? s->num_inputs : s->num;
   if (num != wanted)
@@ -287,7 +287,7 @@ static bool take(call *c, PyObject *const *objects, Py_ssize_t num) {
       if (!take_number(c, i, objects[i])) return false;
       continue;
     }
-    if (!may_be(c, p, given)) return refuse(c, i, PyExc_ValueError, given ? "must be None" : "must not be None");
+    if (!may_be(c, p, given)) return call_refuse(c, i, PyExc_ValueError, given ? "must be None" : "must not be None");
     if (given && !take_array(c, i, objects[i])) return false;
     if (given && !p->output && p->type != FLOATS && !secure(&c->arguments[i])) return false;
   }
@@ -299,7 +299,7 @@ static bool take(call *c, PyObject *const *objects, Py_ssize_t num) {
 
 /* ---- around a kernel ---- */
 
-static bool begin(call *c) {
+static bool call_begin(call *c) {
   for (int i = 0; debug && i < c->spec->num; i++) {
     argument *a = &c->arguments[i];
     if (!a->bytes) continue;
@@ -344,7 +344,7 @@ static bool append_outputs(call *c, PyObject *list) {
   return true;
 }
 
-static bool end(call *c, ast_status status) {
+static bool call_end(call *c, ast_status status) {
   bool ok = !PyErr_Occurred();
   for (int i = 0; debug && i < c->spec->num; i++) {
     argument *a = &c->arguments[i];
@@ -354,7 +354,9 @@ static bool end(call *c, ast_status status) {
     free(a->copy);
     a->copy = NULL;
   }
-  return ok && (status != AST_NO_MEMORY || (PyErr_NoMemory(), false));
+  if (!ok || status != AST_NO_MEMORY) return ok;
+  PyErr_Format(PyExc_MemoryError, "%s: %s", c->spec->name, ast_status_text(status));
+  return false;
 }
 
 #endif

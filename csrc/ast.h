@@ -25,6 +25,9 @@ typedef enum {
   AST_TOO_LARGE,  /* octree_coarsen: more cells than an int32 can number */
 } ast_status;
 
+/* status.c: what it means, in words, for a message; never NULL. */
+const char *ast_status_text(ast_status status);
+
 /* The sizes of one attention: query rows of scene b attend to all key rows of scene b. */
 typedef struct {
   int64_t B, H, D;
@@ -152,8 +155,8 @@ typedef struct {
   const char *isa;
   int vector_bytes;
 
-  /* out[c] = sum (or mean) of x[node_order[j]] for node_offsets[c] <= j < node_offsets[c+1], in that order; 0 if empty.
-   * x [N,F], node_order [node_offsets[C]], out [C,F]. */
+  /* out[c] = sum (or mean) of x[node_order[j]] for node_offsets[c] <= j < node_offsets[c+1], in that order by chains of
+   * 256 rows, whose sums are added by halves; 0 if empty. x [N,F], node_order [node_offsets[C]], out [C,F]. */
   ast_status (*segment_sum)(const float *restrict x, int64_t F, const int64_t *restrict node_order,
                             const int64_t *restrict node_offsets, int64_t C, bool mean, float *restrict out);
   /* The adjoint: dx[node_order[j]] = dout[c] (over the number of rows of c if mean). node_order is a permutation of
@@ -161,11 +164,16 @@ typedef struct {
   ast_status (*segment_spread)(const float *restrict dout, int64_t F, const int64_t *restrict node_order,
                                const int64_t *restrict node_offsets, int64_t C, bool mean, float *restrict dx);
 
-  /* Cells of `positions` [N,3] in the cube center +- half_width cut into 2^depth parts per axis, 0 <= depth <= 21.
-   * Index per axis: floor((p - center + half_width) / (2 half_width) * 2^depth) in double, clamped to [0, 2^depth - 1];
-   * Morton key with x as the most significant axis. Capacity: keys [N], node_offsets [N+1]; cells in use:
-   * cell_offsets[B]. node_order is stable: by scene, key, node. On AST_NOT_FINITE and AST_OUTSIDE (beyond 1e-6 of the
-   * width of the cube) *bad_node is the first such node. */
+  /* The cells that hold points, of a cube that is cut into 2^depth parts per axis.
+   *   positions [N,3], offsets [B+1]; center, half_width: the cube center +- half_width; 0 <= depth <= 21
+   *   keys: of the cells, ascending within a scene; Morton, x the most significant axis; room for N
+   *   cell_offsets [B+1]: the cells of each scene; C = cell_offsets[B] of all
+   *   node_cell [N]: the cell of each point
+   *   node_order [N]: the points by scene, key and number
+   *   node_offsets: [C+1] places in node_order of the points of each cell; room for N + 1
+   *   *bad_node: on AST_NOT_FINITE and AST_OUTSIDE (beyond 1e-6 of the width of the cube) the first such point
+   * Index per axis: floor((p - center + half_width) / (2 half_width) * 2^depth) in double, clamped to
+   * [0, 2^depth - 1]. */
   ast_status (*octree_build)(const float *restrict positions, const int64_t *restrict offsets, int64_t B,
                              const double center[3], double half_width, int depth, int64_t *restrict keys,
                              int64_t *restrict cell_offsets, int64_t *restrict node_cell, int64_t *restrict node_order,
@@ -176,9 +184,12 @@ typedef struct {
    * of pairs (fine, coarse) with fine = 2 P + (a,b,c) of each, grouped by kernel offset 9(a+1) + 3(b+1) + (c+1). */
   ast_status (*octree_coarsen)(const int64_t *restrict keys, const int64_t *restrict offsets, int64_t B, int levels,
                                ast_octree_level *restrict level);
-  /* Writes a level out: keys [C], offsets [B+1], first_child [C+1], node_cell [C_fine] (the parent of each finer cell),
-   * and the pairs twice: (fine, coarse) with coarse rising within each group, and (fine_by_fine, coarse_by_fine) with
-   * fine rising within each group, each array [pair_offsets[27]]. */
+  /* Writes a level out.
+   *   keys [C], offsets [B+1]: as in octree_build
+   *   first_child [C+1]: the finer cells first_child[c] <= j < first_child[c+1] are the children of c
+   *   node_cell [C_fine]: the parent of each finer cell
+   *   fine, coarse [pair_offsets[27]]: the pairs, coarse rising within each group
+   *   fine_by_fine, coarse_by_fine: the same pairs, fine rising within each group */
   ast_status (*octree_write_level)(const ast_octree_level *level, int64_t *restrict keys, int64_t *restrict offsets,
                                    int64_t *restrict first_child, int64_t *restrict node_cell, int64_t *restrict fine,
                                    int64_t *restrict coarse, int64_t *restrict fine_by_fine,
@@ -201,10 +212,12 @@ typedef struct {
   ast_status (*sparse_conv_weight)(const float *restrict x, const float *restrict dout, int64_t C_in, int64_t C_out,
                                    ast_pairs pairs, float *restrict dweight);
 
-  /* out[q,h] = sum_k P[q,h,k] v[k,h], P = dropout(softmax_k(x)) of the scores x = scale q[q,h] . k[k,h]; maximum =
-   * max_k x and sum = sum_k exp(x - maximum), so that log sum exp is maximum + log(sum). q [Tq,H,D], k and v [Tk,H,D],
-   * out [Tq,H,D] dense, maximum and sum [Tq,H]; D is a multiple of 16, at most 128. Without keys: out 0, maximum -inf,
-   * sum 0. A row with a NaN or +inf score, or with only -inf, is NaN in all outputs. */
+  /* Attention of the scores x = scale q[q,h] . k[k,h].
+   *   q [Tq,H,D], k and v [Tk,H,D]: rows at the strides of s; D is a multiple of 16, at most 128
+   *   out [Tq,H,D], dense: out[q,h] = sum_k P[q,h,k] v[k,h], P = dropout(softmax_k(x))
+   *   maximum, sum [Tq,H]: max_k x and sum_k exp(x - maximum), so that log sum exp is maximum + log(sum)
+   * Without keys: out 0, maximum -inf, sum 0. A row with a NaN or +inf score, or with only -inf, is NaN in all
+   * outputs. */
   ast_status (*attention)(const ast_attention *s, const float *restrict q, const float *restrict k,
                           const float *restrict v, float *restrict out, float *restrict maximum, float *restrict sum);
   /* Its gradients, P recomputed from maximum and sum. dq [Tq,H,D], dk and dv [Tk,H,D]. */
@@ -219,7 +232,7 @@ typedef struct {
   ast_status (*attention_block_backward)(const ast_attention_block *s, const float *restrict dout,
                                          ast_attention_block_kept kept, ast_attention_block_gradients g);
 
-  /* sum[r] = sum over the edges m into r, in stored order, of messages[m] = LN(W2 relu(z_m) + b2; gamma, beta), where
+  /* sum[r] = sum over the edges m into r, in stored order by chains of 256, of messages[m] = LN(W2 relu(z_m) + b2; gamma, beta), where
    * z_m = of_senders[s] + of_receivers[r] + A2 relu(A1 e_m + a1), or + e_m without an encoder; 0 without edges.
    * sum [R,F2]; messages [M,F2] or NULL. */
   ast_status (*message)(const ast_message *s, float *restrict sum, float *restrict messages);
@@ -237,7 +250,7 @@ typedef struct {
                                 const float *restrict weight, const float *restrict bias, const float *restrict z,
                                 float *restrict dx, float *restrict dweight, float *restrict dbias);
   /* force [N,3] = -dE/dposition of the energy E = sum_e V (lambda/2 tr(G)^2 + mu G:G), G = (F^T F - I) / 2, added at
-   * each node in the order of node_order. An element contributes exactly nothing, whatever its positions, if its Lame
+   * each node in the order of node_order, by chains of 256 whose sums are added by halves. An element contributes exactly nothing, whatever its positions, if its Lame
    * constants are both 0, a rest position is not finite, or its rest volume is no more than rounding. */
   ast_status (*elastic_forces)(const ast_elastic *s, float *restrict force);
   /* dposition [N,3] = (dforce/dposition) dforce, whose matrix is symmetric: the gradient. */

@@ -40,41 +40,42 @@ typedef struct {
   int64_t partial_rows;             /* queries of the states that the parts leave */
   int64_t partial_floats;           /* floats of such a state */
   int64_t first_partial;            /* floats of such states before this scene */
-} forward_cut;
+} attention_forward_cut;
 
 typedef struct {
   const ast_attention *s;
   const float *q, *k, *v;
   float *out, *maximum, *sum;
-  const forward_cut *cuts;                 /* [B] */
+  const attention_forward_cut *cuts;       /* [B] */
   const int64_t *first_task, *first_merge; /* [B+1] of each scene */
   float *partials;
-} forward_job;
+} attention_forward_job;
 
 /* What a task knows of its queries: o [query][ROW], m and l [query], and the unit of all weights. */
 typedef struct {
   float *out, *maximum, *sum, *unit;
-} forward_state;
+} attention_forward_state;
 
 typedef struct {
   float keys[KEYS * ROW], values[KEYS * ROW];
   float scores[KEYS * ROW];
   dropout_words words[2];
-  float queries[QUERIES * MAX_D]; /* scale Q in panels */
+  float queries[QUERIES * MAX_D]; /* scale Q in panels, */
+  float scale;                    /* or Q and the scale of its scores, which is 1 otherwise */
   float out[QUERIES * ROW], maximum[QUERIES], sum[QUERIES], unit;
-} forward_scratch;
+} attention_forward_scratch;
 
 /* The scene, head, queries and keys of a task. */
 typedef struct {
-  const forward_cut *cut;
+  const attention_forward_cut *cut;
   int64_t b, h, part, first_query, rows, first_key, keys;
   int32_t shift;
-} forward_range;
+} attention_forward_range;
 
 /* ---- a panel against a block of keys ---- */
 
 /* Scores x become exp(x - base) 2^-shift; their sums over the n keys. */
-AST_INLINE void weights(float *x, int64_t n, const vf base[2], int32_t shift, vf sum[2]) {
+AST_INLINE void attention_weights(float *x, int64_t n, const vf base[2], int32_t shift, vf sum[2]) {
   for (int64_t j = 0; j < n; j++) {
     EACH(2, c) {
       const vf p = vexp(vload(x + j * ROW + c * VW) - base[c], shift);
@@ -85,8 +86,8 @@ AST_INLINE void weights(float *x, int64_t n, const vf base[2], int32_t shift, vf
 }
 
 /* The same, with dropped weights 0; the sums are of all. */
-AST_INLINE void dropped_weights(float *x, int64_t n, const vf base[2], int32_t shift, const dropout *d,
-                                dropout_words words[2], vf sum[2]) {
+AST_INLINE void attention_dropped_weights(float *x, int64_t n, const vf base[2], int32_t shift, const dropout *d,
+                                          dropout_words words[2], vf sum[2]) {
   const vu threshold = (vu){0} + (d->threshold << 16);
   EACH(DROPOUT_SLOTS, slot) {
     for (int64_t lane = 0; lane < min64(n - slot * DROPOUT_LANES, DROPOUT_LANES); lane++) {
@@ -100,13 +101,27 @@ AST_INLINE void dropped_weights(float *x, int64_t n, const vf base[2], int32_t s
   }
 }
 
+/* Scores of n keys times a factor, and their maximum. */
+static __attribute__((noinline)) void attention_scale_scores(int64_t n, float factor, float *x, vf largest[2]) {
+  EACH(2, c) largest[c] = vsplat(-INFINITY);
+  for (int64_t j = 0; j < n; j++) {
+    EACH(2, c) {
+      const vf scaled = factor * vload(x + j * ROW + c * VW);
+      vstore(x + j * ROW + c * VW, scaled);
+      largest[c] = vmax(scaled, largest[c]);
+    }
+  }
+}
+
 /* Takes n keys, k0 the first of them in the scene, into the state of a panel, the queries i0..i0+rows of the task. */
-static void forward_panel(forward_scratch *t, const forward_state *state, int64_t i0, int64_t rows, int64_t query,
-                          int64_t k0, int64_t n, int64_t D, int32_t shift, bool first, const dropout *d) {
+static void attention_forward_panel(attention_forward_scratch *t, const attention_forward_state *state, int64_t i0,
+                                    int64_t rows, int64_t query, int64_t k0, int64_t n, int64_t D, int32_t shift,
+                                    bool first, const dropout *d) {
   float *m = state->maximum + i0, *l = state->sum + i0, fade[LANES];
   const float *queries = t->queries + i0 * D;
   vf largest[2] = {vsplat(-INFINITY), vsplat(-INFINITY)}, base[2], sum[2] = {{0}};
-  scores_product(round_up(n, ROW_STEP), D, t->keys, queries, t->scores, largest);
+  attention_scores(round_up(n, ROW_STEP), D, t->keys, queries, t->scores, largest);
+  if (t->scale != 1) attention_scale_scores(n, t->scale, t->scores, largest);
   EACH(2, c) {
     const vf before = vload(m + c * VW), now = vmax(largest[c], before);
     base[c] = vselect(now == -INFINITY, (vf){0}, now); /* only -inf so far: weights 0, not NaN */
@@ -115,16 +130,17 @@ static void forward_panel(forward_scratch *t, const forward_state *state, int64_
   }
   if (d->threshold) {
     for (int64_t c = 0; c < 2; c++) dropout_draw_queries(d, query + c * VW, k0, n, t->words[c]);
-    dropped_weights(t->scores, n, base, shift, d, t->words, sum);
+    attention_dropped_weights(t->scores, n, base, shift, d, t->words, sum);
   } else {
-    weights(t->scores, n, base, shift, sum);
+    attention_weights(t->scores, n, base, shift, sum);
   }
   EACH(2, c) vstore(l + c * VW, vload(l + c * VW) * vload(fade + c * VW) + sum[c]);
-  faded_product(round_up(rows, ROW_STEP), D, n, t->scores, t->values, state->out + i0 * ROW, first ? NULL : fade);
+  attention_faded_product(round_up(rows, ROW_STEP), D, n, t->scores, t->values, state->out + i0 * ROW,
+                          first ? NULL : fade);
 }
 
 /* Whether one of the n rows has a number of larger magnitude. */
-static bool holds_larger(const float *rows, int64_t n, int64_t D, float limit) {
+static bool attention_holds_larger(const float *rows, int64_t n, int64_t D, float limit) {
   vf largest = {0};
   for (int64_t i = 0; i < n; i++)
     for (int64_t d = 0; d < D; d += VW) {
@@ -137,7 +153,7 @@ static bool holds_larger(const float *rows, int64_t n, int64_t D, float limit) {
 }
 
 /* Another unit of the weights in the first rows of a state. */
-static void set_unit(const forward_state *state, int64_t rows, int64_t D, float unit) {
+static void attention_set_unit(const attention_forward_state *state, int64_t rows, int64_t D, float unit) {
   const float factor = *state->unit / unit;
   *state->unit = unit;
   for (int64_t i = 0; i < rows; i++) {
@@ -151,8 +167,8 @@ static void set_unit(const forward_state *state, int64_t rows, int64_t D, float 
 
 /* ---- tasks ---- */
 
-static forward_cut cut_of(const ast_attention *s, int64_t b) {
-  forward_cut cut = {.q0 = s->q_offsets[b], .k0 = s->k_offsets[b]};
+static attention_forward_cut attention_cut_forward(const ast_attention *s, int64_t b) {
+  attention_forward_cut cut = {.q0 = s->q_offsets[b], .k0 = s->k_offsets[b]};
   cut.queries = s->q_offsets[b + 1] - cut.q0;
   cut.keys = s->k_offsets[b + 1] - cut.k0;
   cut.chunks = divide_up(cut.queries, QUERIES);
@@ -165,11 +181,13 @@ static forward_cut cut_of(const ast_attention *s, int64_t b) {
 }
 
 /* Task `index`, or that merge: merges are not parted. */
-static forward_range find_forward_range(const forward_job *job, int64_t index, bool merge) {
+static attention_forward_range attention_find_forward_range(const attention_forward_job *job, int64_t index,
+                                                            bool merge) {
   const int64_t *first = merge ? job->first_merge : job->first_task, b = scene_at(first, job->s->B, index);
-  const forward_cut *cut = job->cuts + b;
+  const attention_forward_cut *cut = job->cuts + b;
   const int64_t parts = merge ? 1 : cut->parts, local = index - first[b];
-  forward_range t = {.cut = cut, .b = b, .h = local / (cut->chunks * parts), .part = local / cut->chunks % parts};
+  attention_forward_range t = {
+      .cut = cut, .b = b, .h = local / (cut->chunks * parts), .part = local / cut->chunks % parts};
   t.first_query = local % cut->chunks * QUERIES;
   t.rows = min64(QUERIES, cut->queries - t.first_query);
   t.first_key = t.part * cut->part_keys;
@@ -179,15 +197,17 @@ static forward_range find_forward_range(const forward_job *job, int64_t index, b
 }
 
 /* What `part` leaves of the task's queries. */
-static forward_state partial_of(const forward_job *job, const forward_range *t, int64_t part) {
-  const forward_cut *cut = t->cut;
+static attention_forward_state attention_partial_of(const attention_forward_job *job, const attention_forward_range *t,
+                                                    int64_t part) {
+  const attention_forward_cut *cut = t->cut;
   const int64_t number = (t->h * cut->chunks + t->first_query / QUERIES) * cut->parts + part, rows = cut->partial_rows;
   float *out = job->partials + cut->first_partial + number * cut->partial_floats;
-  return (forward_state){out, out + rows * ROW, out + rows * (ROW + 1), out + rows * (ROW + 2)};
+  return (attention_forward_state){out, out + rows * ROW, out + rows * (ROW + 1), out + rows * (ROW + 2)};
 }
 
 /* out = gain o / l, maximum and sum of the task's queries */
-static void finish(const forward_job *job, const forward_range *t, const forward_state *state) {
+static void attention_finish_forward(const attention_forward_job *job, const attention_forward_range *t,
+                                     const attention_forward_state *state) {
   const ast_attention *s = job->s;
   const int64_t H = s->H, D = s->D, q0 = t->cut->q0 + t->first_query;
   const float gain = dropout_of(s, t->b, t->h).gain;
@@ -200,60 +220,61 @@ static void finish(const forward_job *job, const forward_range *t, const forward
   }
 }
 
-static ast_status forward_task(int64_t index, void *context) {
-  const forward_job *job = context;
+static ast_status attention_forward_task(int64_t index, void *context) {
+  const attention_forward_job *job = context;
   const ast_attention *s = job->s;
-  const forward_range task = find_forward_range(job, index, false);
+  const attention_forward_range task = attention_find_forward_range(job, index, false);
   const int64_t H = s->H, D = s->D, h = task.h, rows = task.rows, q0 = task.cut->q0 + task.first_query;
   if (task.keys == 0) {
-    fill_rows(0, H * D, rows, D, job->out + (q0 * H + h) * D);
-    fill_rows(-INFINITY, H, rows, 1, job->maximum + q0 * H + h);
-    fill_rows(0, H, rows, 1, job->sum + q0 * H + h);
+    attention_fill_rows(0, H * D, rows, D, job->out + (q0 * H + h) * D);
+    attention_fill_rows(-INFINITY, H, rows, 1, job->maximum + q0 * H + h);
+    attention_fill_rows(0, H, rows, 1, job->sum + q0 * H + h);
     return AST_OK;
   }
-  forward_scratch *t = ast_scratch(sizeof *t);
+  attention_forward_scratch *t = ast_scratch(sizeof *t);
   if (!t) return AST_NO_MEMORY;
   const bool whole = task.cut->parts == 1;
-  const forward_state state =
-      whole ? (forward_state){t->out, t->maximum, t->sum, &t->unit} : partial_of(job, &task, task.part);
+  const attention_forward_state state = whole ? (attention_forward_state){t->out, t->maximum, t->sum, &t->unit}
+                                              : attention_partial_of(job, &task, task.part);
   const dropout d = dropout_of(s, task.b, h);
   const int64_t panels = divide_up(rows, LANES), share = divide_up(KEYS, panels);
   for (int64_t p = 0; p < panels; p++)
-    pack_panel(job->q + (q0 + p * LANES) * s->q_stride + h * D, s->q_stride, rows - p * LANES, D, s->scale,
-               t->queries + p * LANES * D);
-  fill_rows(0, 0, 1, panels * LANES, state.sum);
-  fill_rows(-INFINITY, 0, 1, panels * LANES, state.maximum);
+    attention_pack_panel(job->q + (q0 + p * LANES) * s->q_stride + h * D, s->q_stride, rows - p * LANES, D,
+                         attention_scale_of_queries(s->scale), t->queries + p * LANES * D);
+  t->scale = attention_scale_of_scores(s->scale);
+  attention_fill_rows(0, 0, 1, panels * LANES, state.sum);
+  attention_fill_rows(-INFINITY, 0, 1, panels * LANES, state.maximum);
   *state.unit = ldexpf(1, -LIFT);
   for (int64_t k0 = 0; k0 < task.keys; k0 += KEYS) {
     const int64_t n = min64(KEYS, task.keys - k0), row = task.cut->k0 + task.first_key + k0;
     const float *k = job->k + row * s->k_stride + h * D, *v = job->v + row * s->v_stride + h * D;
-    copy_rows(k, s->k_stride, n, D, 1, t->keys);
-    copy_rows(v, s->v_stride, n, D, 1, t->values);
-    if (*state.unit < 1 && holds_larger(t->values, n, D, ldexpf(FLT_MAX, -LIFT - task.shift)))
-      set_unit(&state, k0 ? panels * LANES : 0, D, ldexpf(1, task.shift));
+    attention_copy_rows(k, s->k_stride, n, D, 1, t->keys);
+    attention_copy_rows(v, s->v_stride, n, D, 1, t->values);
+    if (*state.unit < 1 && attention_holds_larger(t->values, n, D, ldexpf(FLT_MAX, -LIFT - task.shift)))
+      attention_set_unit(&state, k0 ? panels * LANES : 0, D, ldexpf(1, task.shift));
     for (int64_t p = 0; p < panels; p++) {
       const int64_t next = KEYS + p * share, ahead = min64(share, task.keys - k0 - next);
-      prefetch_rows(k + next * s->k_stride, s->k_stride, ahead, D, 0);
-      prefetch_rows(v + next * s->v_stride, s->v_stride, ahead, D, 0);
-      forward_panel(t, &state, p * LANES, min64(LANES, rows - p * LANES), task.first_query + p * LANES,
-                    task.first_key + k0, n, D, *state.unit < 1 ? -LIFT : task.shift, k0 == 0, &d);
+      attention_prefetch_rows(k + next * s->k_stride, s->k_stride, ahead, D, 0);
+      attention_prefetch_rows(v + next * s->v_stride, s->v_stride, ahead, D, 0);
+      attention_forward_panel(t, &state, p * LANES, min64(LANES, rows - p * LANES), task.first_query + p * LANES,
+                              task.first_key + k0, n, D, *state.unit < 1 ? -LIFT : task.shift, k0 == 0, &d);
     }
   }
-  if (whole) finish(job, &task, &state);
+  if (whole) attention_finish_forward(job, &task, &state);
   return AST_OK;
 }
 
 /* Merges the parts of one scene, head and chunk of queries, in their order. */
-static ast_status merge_task(int64_t index, void *context) {
-  const forward_job *job = context;
-  const forward_range task = find_forward_range(job, index, true);
+static ast_status attention_merge_task(int64_t index, void *context) {
+  const attention_forward_job *job = context;
+  const attention_forward_range task = attention_find_forward_range(job, index, true);
   const int64_t D = job->s->D;
-  const forward_state into = partial_of(job, &task, 0);
+  const attention_forward_state into = attention_partial_of(job, &task, 0);
   for (int64_t part = 1; part < task.cut->parts; part++) {
-    const forward_state from = partial_of(job, &task, part);
+    const attention_forward_state from = attention_partial_of(job, &task, part);
     const float unit = *from.unit > *into.unit ? *from.unit : *into.unit;
-    set_unit(&into, task.rows, D, unit);
-    set_unit(&from, task.rows, D, unit);
+    attention_set_unit(&into, task.rows, D, unit);
+    attention_set_unit(&from, task.rows, D, unit);
     float fade[QUERIES], weight[QUERIES];
     for (int64_t i = 0; i < task.rows; i += VW) {
       const vf before = vload(into.maximum + i), other = vload(from.maximum + i), now = vmax(other, before);
@@ -269,7 +290,7 @@ static ast_status merge_task(int64_t index, void *context) {
         vstore(o, vload(o) * fade[i] + vload(from.out + i * ROW + d) * weight[i]);
       }
   }
-  finish(job, &task, &into);
+  attention_finish_forward(job, &task, &into);
   return AST_OK;
 }
 
@@ -277,13 +298,13 @@ static ast_status attention(const ast_attention *s, const float *restrict q, con
                             const float *restrict v, float *restrict out, float *restrict maximum,
                             float *restrict sum) {
   AST_SCRATCH_SCOPE;
-  forward_cut *cuts = ast_scratch(s->B * (int64_t)sizeof *cuts);
+  attention_forward_cut *cuts = ast_scratch(s->B * (int64_t)sizeof *cuts);
   int64_t *first_task = ast_scratch(2 * (s->B + 1) * (int64_t)sizeof *first_task), floats = 0;
   if (!cuts || !first_task) return AST_NO_MEMORY;
   int64_t *first_merge = first_task + s->B + 1;
   first_task[0] = first_merge[0] = 0;
   for (int64_t b = 0; b < s->B; b++) {
-    cuts[b] = cut_of(s, b);
+    cuts[b] = attention_cut_forward(s, b);
     cuts[b].first_partial = floats;
     const int64_t chunks = s->H * cuts[b].chunks, merges = cuts[b].parts > 1 ? chunks : 0;
     first_task[b + 1] = first_task[b] + chunks * cuts[b].parts;
@@ -292,7 +313,7 @@ static ast_status attention(const ast_attention *s, const float *restrict q, con
   }
   float *partials = ast_scratch(floats * (int64_t)sizeof *partials);
   if (!partials) return AST_NO_MEMORY;
-  forward_job job = {s, q, k, v, out, maximum, sum, cuts, first_task, first_merge, partials};
-  const ast_status status = ast_parallel(first_task[s->B], forward_task, &job);
-  return status == AST_OK ? ast_parallel(first_merge[s->B], merge_task, &job) : status;
+  attention_forward_job job = {s, q, k, v, out, maximum, sum, cuts, first_task, first_merge, partials};
+  const ast_status status = ast_parallel(first_task[s->B], attention_forward_task, &job);
+  return status == AST_OK ? ast_parallel(first_merge[s->B], attention_merge_task, &job) : status;
 }

@@ -39,14 +39,14 @@ typedef struct {
   int64_t parts, part_rows;            /* rows of a part */
   int64_t partial_size, first_partial; /* floats of a partial gradient, of dq or of dk and dv; and before this scene */
   int64_t peaks, first_peak;           /* of a head: of all queries, once for each part of the keys; and before */
-} backward_cut;
+} attention_backward_cut;
 
 /* Of a query whose weights are nearly all of one key: that key of the scene, or -1 if it is in no block so far, and the
  * sum of dS. */
 typedef struct {
   int64_t key;
   float sum;
-} backward_peak;
+} attention_backward_peak;
 
 static const float PEAK = 0.875f;        /* the weight from which a key is one */
 static const float LEAST_SUM = 0x1p-46f; /* of the terms of dS: what is smaller would be 0 in double, too */
@@ -55,37 +55,39 @@ typedef struct {
   const ast_attention *s;
   const float *q, *k, *v, *out, *maximum, *sum, *dout;
   float *dq, *dk, *dv;
-  const backward_cut *cuts;  /* [B] */
-  const int64_t *first_task; /* [B+1] of each scene */
+  const attention_backward_cut *cuts; /* [B] */
+  const int64_t *first_task;          /* [B+1] of each scene */
   float *partials;
-  backward_peak *peaks; /* [parts by keys, queries] of each scene and head */
+  attention_backward_peak *peaks; /* [parts by keys, queries] of each scene and head */
   bool any_peaks;
-} backward_job;
+} attention_backward_job;
 
 typedef struct {
   float keys[KEYS * ROW], key_panels[KEYS * MAX_D],
       value_panels[KEYS * MAX_D]; /* K by rows and in panels, gain V in panels */
   float dk[KEYS * ROW], dv[KEYS * ROW];
   float weights[SQUARE * ROW], dscores[SQUARE * ROW];             /* P . keep and dS as [query][key] */
-  float queries[CHUNK * ROW], dout[CHUNK * ROW], dq[CHUNK * ROW]; /* scale Q, y and dQ / scale */
+  float queries[CHUNK * ROW], dout[CHUNK * ROW], dq[CHUNK * ROW]; /* scale Q, y and dQ / scale; or */
+  float scale; /* Q and the scale of its scores, which is 1 otherwise */
   dropout_row words[GROUP];
   float maximum[CHUNK], share[CHUNK], delta[CHUNK]; /* m, 1 / l, rowsum(y . out) */
-  backward_peak peaks[CHUNK];
-} backward_scratch;
+  attention_backward_peak peaks[CHUNK];
+} attention_backward_scratch;
 
 /* The scene, head, queries and keys of a task, and where its gradients go: rows [.][stride]. */
 typedef struct {
-  const backward_cut *cut;
+  const attention_backward_cut *cut;
   int64_t b, h, first_query, queries, first_key, keys;
   float *dq, *dk, *dv;
   int64_t dq_stride, dk_stride, dv_stride;
   int64_t first_peak; /* of the scene's first query */
-} backward_range;
+} attention_backward_range;
 
 /* ---- a square of queries against a block of keys ---- */
 
 /* Score x and gain y V^T become P . keep and dS. Words NULL: all are kept; so is a row that is NaN, as 0 NaN is NaN. */
-AST_INLINE void gradient(float *x, float *dx, vf maximum, vf share, vf delta, const vu *words, int slot, vu threshold) {
+AST_INLINE void attention_gradient(float *x, float *dx, vf maximum, vf share, vf delta, const vu *words, int slot,
+                                   vu threshold) {
   const vf p = share * vexp(vload(x) - maximum, 0), dp = vload(dx);
   threshold &= (vu)(maximum == maximum);
   vstore(x, words ? dropout_keep(words, slot, threshold, p) : p);
@@ -93,7 +95,7 @@ AST_INLINE void gradient(float *x, float *dx, vf maximum, vf share, vf delta, co
 }
 
 /* The first of n scores that is the maximum, or -1. */
-static int64_t find_peak(const float *x, int64_t n, float maximum) {
+static int64_t attention_find_peak(const float *x, int64_t n, float maximum) {
   int64_t c = 0;
   for (; c + VW <= n; c += VW)
     if (vsum((vf)((vload(x + c) == maximum) & (vi)vsplat(1))) > 0) break;
@@ -102,20 +104,20 @@ static int64_t find_peak(const float *x, int64_t n, float maximum) {
   return -1;
 }
 
-static float sum_of(const float *x, int64_t n) {
+static float attention_sum_of(const float *x, int64_t n) {
   vf sum = {0};
   for (int64_t c = 0; c < n; c += VW) sum += vload_upto(x + c, n - c);
   return vsum(sum);
 }
 
 /* Weights and their gradients of the queries i..i+rows in the scratch; k0 the first of n keys of the scene. */
-static void backward_group(backward_scratch *t, int64_t i, int64_t rows, int64_t query, int64_t k0, int64_t n,
-                           int64_t D, const dropout *d) {
+static void attention_backward_group(attention_backward_scratch *t, int64_t i, int64_t rows, int64_t query, int64_t k0,
+                                     int64_t n, int64_t D, const dropout *d) {
   float *x = t->weights + i % SQUARE * ROW, *dx = t->dscores + i % SQUARE * ROW;
   const int64_t whole = round_up(rows, ROW_STEP);
   for (int64_t c = 0; c < n; c += LANES) {
-    scores_product(whole, D, t->queries + i * ROW, t->key_panels + c * D, x + c, NULL);
-    scores_product(whole, D, t->dout + i * ROW, t->value_panels + c * D, dx + c, NULL);
+    attention_scores(whole, D, t->queries + i * ROW, t->key_panels + c * D, x + c, NULL);
+    attention_scores(whole, D, t->dout + i * ROW, t->value_panels + c * D, dx + c, NULL);
   }
   const vu threshold = (vu){0} + (d->threshold << 16);
   if (d->threshold)
@@ -123,41 +125,43 @@ static void backward_group(backward_scratch *t, int64_t i, int64_t rows, int64_t
   for (int64_t r = 0; r < rows; r++) {
     const vf maximum = vsplat(t->maximum[i + r]), share = vsplat(t->share[i + r]), delta = vsplat(t->delta[i + r]);
     float *x_r = x + r * ROW, *dx_r = dx + r * ROW;
-    backward_peak *peak = t->share[i + r] > PEAK ? &t->peaks[i + r] : NULL;
+    for (int64_t c = 0; t->scale != 1 && c < n; c += VW) vstore(x_r + c, t->scale * vload(x_r + c));
+    attention_backward_peak *peak = t->share[i + r] > PEAK ? &t->peaks[i + r] : NULL;
     if (peak && peak->key < 0) {
-      const int64_t at = find_peak(x_r, n, t->maximum[i + r]);
+      const int64_t at = attention_find_peak(x_r, n, t->maximum[i + r]);
       if (at >= 0) peak->key = k0 + at;
     }
     for (int64_t c = 0; !d->threshold && c < n; c += VW)
-      gradient(x_r + c, dx_r + c, maximum, share, delta, NULL, 0, threshold);
+      attention_gradient(x_r + c, dx_r + c, maximum, share, delta, NULL, 0, threshold);
     EACH(DROPOUT_SLOTS, slot) {
       if (!d->threshold || slot * DROPOUT_LANES >= n) break;
       EACH(DROPOUT_PARTS, part) {
         const int64_t c = slot * DROPOUT_LANES + part * VW;
-        gradient(x_r + c, dx_r + c, maximum, share, delta, t->words[r][part], slot, threshold);
+        attention_gradient(x_r + c, dx_r + c, maximum, share, delta, t->words[r][part], slot, threshold);
       }
     }
-    if (peak) peak->sum += sum_of(dx_r, n);
+    if (peak) peak->sum += attention_sum_of(dx_r, n);
+    for (int64_t c = 0; t->scale != 1 && c < n; c += VW) vstore(dx_r + c, t->scale * vload(dx_r + c));
   }
 }
 
 /* ---- tasks ---- */
 
 /* The queries first..first+rows of the scene of `range`: rows, m, 1 / l and delta. */
-static void load_queries(const backward_job *job, const backward_range *range, int64_t first, int64_t rows,
-                         backward_scratch *t) {
+static void attention_load_queries(const attention_backward_job *job, const attention_backward_range *range,
+                                   int64_t first, int64_t rows, attention_backward_scratch *t) {
   const ast_attention *s = job->s;
   const int64_t H = s->H, D = s->D, h = range->h, q0 = range->cut->q0 + first;
   const float *q = job->q + q0 * s->q_stride + h * D, *dout = job->dout + (q0 * H + h) * D,
               *out = job->out + (q0 * H + h) * D;
-  copy_rows(q, s->q_stride, rows, D, s->scale, t->queries);
-  copy_rows(dout, H * D, rows, D, 1, t->dout);
+  attention_copy_rows(q, s->q_stride, rows, D, attention_scale_of_queries(s->scale), t->queries);
+  attention_copy_rows(dout, H * D, rows, D, 1, t->dout);
   for (int64_t i = 0; i < rows; i += VW) {
     vf sum = {0}, chain = {0}; /* in the order of the products, so that a weight of 1 leaves dS = 0 */
     for (int64_t e = 0; e < D; e += VW) {
       vf x[VW], y[VW];
-      load_transposed(t->dout + i * ROW + e, ROW, rows - i, y);
-      load_transposed(out + i * H * D + e, H * D, rows - i, x);
+      attention_load_transposed(t->dout + i * ROW + e, ROW, rows - i, y);
+      attention_load_transposed(out + i * H * D + e, H * D, rows - i, x);
       EACH(VW, j) chain += y[j] * x[j];
       if ((e + VW) % SCORE_DEPTH && e + VW < D) continue;
       sum = chain + sum, chain = (vf){0};
@@ -167,12 +171,13 @@ static void load_queries(const backward_job *job, const backward_range *range, i
   for (int64_t i = 0; i < rows; i++) {
     t->maximum[i] = job->maximum[(q0 + i) * H + h];
     t->share[i] = 1 / job->sum[(q0 + i) * H + h];
-    t->peaks[i] = (backward_peak){-1, 0};
+    t->peaks[i] = (attention_backward_peak){-1, 0};
   }
 }
 
 /* to = (to +) factor from, rows of `from` ROW apart */
-static void put_rows(const float *from, int64_t rows, int64_t D, float factor, bool add, float *to, int64_t stride) {
+static void attention_put_rows(const float *from, int64_t rows, int64_t D, float factor, bool add, float *to,
+                               int64_t stride) {
   for (int64_t i = 0; i < rows; i++)
     for (int64_t d = 0; d < D; d += VW) {
       const vf x = factor * vload(from + i * ROW + d);
@@ -182,15 +187,16 @@ static void put_rows(const float *from, int64_t rows, int64_t D, float factor, b
 
 /* The queries first..first+rows, which the scratch holds, against the block of n keys from k0 on, all counted from the
  * scene's first. */
-static void backward_block(const backward_job *job, const backward_range *range, int64_t first, int64_t rows,
-                           int64_t k0, int64_t n, const dropout *d, backward_scratch *t) {
+static void attention_backward_block(const attention_backward_job *job, const attention_backward_range *range,
+                                     int64_t first, int64_t rows, int64_t k0, int64_t n, const dropout *d,
+                                     attention_backward_scratch *t) {
   const ast_attention *s = job->s;
   const int64_t D = s->D, row = range->cut->k0 + k0, whole = round_up(n, ROW_STEP);
   const float *k = job->k + row * s->k_stride + range->h * D, *v = job->v + row * s->v_stride + range->h * D;
-  copy_rows(k, s->k_stride, n, D, 1, t->keys);
+  attention_copy_rows(k, s->k_stride, n, D, 1, t->keys);
   for (int64_t c = 0; c < n; c += LANES) {
-    pack_panel(t->keys + c * ROW, ROW, n - c, D, 1, t->key_panels + c * D);
-    pack_panel(v + c * s->v_stride, s->v_stride, n - c, D, d->gain, t->value_panels + c * D);
+    attention_pack_panel(t->keys + c * ROW, ROW, n - c, D, 1, t->key_panels + c * D);
+    attention_pack_panel(v + c * s->v_stride, s->v_stride, n - c, D, d->gain, t->value_panels + c * D);
   }
   float *dk = range->dk + (k0 - range->first_key) * range->dk_stride,
         *dv = range->dv + (k0 - range->first_key) * range->dv_stride;
@@ -200,23 +206,23 @@ static void backward_block(const backward_job *job, const backward_range *range,
     const int64_t width = min64(SQUARE, rows - i0);
     for (int64_t i = i0; i < i0 + width; i += GROUP) {
       const int64_t at = i / GROUP * share;
-      prefetch_rows(k + (KEYS + at) * s->k_stride, s->k_stride, min64(share, left - at), D, 0);
-      prefetch_rows(v + (KEYS + at) * s->v_stride, s->v_stride, min64(share, left - at), D, 0);
-      prefetch_rows(dk + at * range->dk_stride, range->dk_stride, min64(share, n - at), D, 1);
-      prefetch_rows(dv + at * range->dv_stride, range->dv_stride, min64(share, n - at), D, 1);
-      backward_group(t, i, min64(GROUP, i0 + width - i), first + i, k0, n, D, d);
+      attention_prefetch_rows(k + (KEYS + at) * s->k_stride, s->k_stride, min64(share, left - at), D, 0);
+      attention_prefetch_rows(v + (KEYS + at) * s->v_stride, s->v_stride, min64(share, left - at), D, 0);
+      attention_prefetch_rows(dk + at * range->dk_stride, range->dk_stride, min64(share, n - at), D, 1);
+      attention_prefetch_rows(dv + at * range->dv_stride, range->dv_stride, min64(share, n - at), D, 1);
+      attention_backward_group(t, i, min64(GROUP, i0 + width - i), first + i, k0, n, D, d);
     }
     gemm(whole, D, width, t->weights, ROW, t->dout + i0 * ROW, ROW, t->dv, ROW, i0 > 0);
     gemm(whole, D, width, t->dscores, ROW, t->queries + i0 * ROW, ROW, t->dk, ROW, i0 > 0);
     gemm_inlined(round_up(width, ROW_STEP), D, n, (gemm_a){t->dscores, ROW, 1}, t->keys, ROW, t->dq + i0 * ROW, ROW,
                  k0 > range->first_key);
   }
-  put_rows(t->dk, n, D, 1, first > range->first_query, dk, range->dk_stride);
-  put_rows(t->dv, n, D, d->gain, first > range->first_query, dv, range->dv_stride);
+  attention_put_rows(t->dk, n, D, 1, first > range->first_query, dk, range->dk_stride);
+  attention_put_rows(t->dv, n, D, d->gain, first > range->first_query, dv, range->dv_stride);
 }
 
-static backward_cut cut_backward(const ast_attention *s, int64_t b) {
-  backward_cut cut = {.q0 = s->q_offsets[b], .k0 = s->k_offsets[b]};
+static attention_backward_cut attention_cut_backward(const ast_attention *s, int64_t b) {
+  attention_backward_cut cut = {.q0 = s->q_offsets[b], .k0 = s->k_offsets[b]};
   cut.queries = s->q_offsets[b + 1] - cut.q0;
   cut.keys = s->k_offsets[b + 1] - cut.k0;
   cut.by_queries = cut.queries > cut.keys;
@@ -230,9 +236,9 @@ static backward_cut cut_backward(const ast_attention *s, int64_t b) {
 }
 
 /* Leaves the peaks of the queries first..first+rows of the scene. */
-static void put_peaks(backward_job *job, const backward_range *range, int64_t first, int64_t rows,
-                      const backward_scratch *t) {
-  backward_peak *to = job->peaks + range->first_peak + first;
+static void attention_put_peaks(attention_backward_job *job, const attention_backward_range *range, int64_t first,
+                                int64_t rows, const attention_backward_scratch *t) {
+  attention_backward_peak *to = job->peaks + range->first_peak + first;
   bool any = false;
   for (int64_t i = 0; i < rows; i++) {
     to[i] = t->peaks[i];
@@ -243,12 +249,12 @@ static void put_peaks(backward_job *job, const backward_range *range, int64_t fi
 }
 
 /* Takes off the dS of each peak what its row sums to. */
-static void settle_peaks(const backward_job *job, const backward_cut *cut, int64_t h) {
+static void attention_settle_peaks(const attention_backward_job *job, const attention_backward_cut *cut, int64_t h) {
   const ast_attention *s = job->s;
   const int64_t D = s->D;
-  const backward_peak *peaks = job->peaks + cut->first_peak + h * cut->peaks;
+  const attention_backward_peak *peaks = job->peaks + cut->first_peak + h * cut->peaks;
   for (int64_t i = 0; i < min64(cut->queries, cut->peaks); i++) {
-    backward_peak all = {-1, 0};
+    attention_backward_peak all = {-1, 0};
     for (int64_t at = i; at < cut->peaks; at += cut->queries) {
       all.sum += peaks[at].sum;
       if (all.key < 0) all.key = peaks[at].key;
@@ -265,12 +271,12 @@ static void settle_peaks(const backward_job *job, const backward_cut *cut, int64
   }
 }
 
-static backward_range find_range(const backward_job *job, int64_t index) {
+static attention_backward_range attention_find_backward_range(const attention_backward_job *job, int64_t index) {
   const ast_attention *s = job->s;
   const int64_t b = scene_at(job->first_task, s->B, index), D = s->D;
-  const backward_cut *cut = job->cuts + b;
+  const attention_backward_cut *cut = job->cuts + b;
   const int64_t h = (index - job->first_task[b]) / cut->parts, part = (index - job->first_task[b]) % cut->parts;
-  backward_range r = {.cut = cut, .b = b, .h = h, .queries = cut->queries, .keys = cut->keys};
+  attention_backward_range r = {.cut = cut, .b = b, .h = h, .queries = cut->queries, .keys = cut->keys};
   const int64_t before = part * cut->part_rows;
   float *partial = job->partials + cut->first_partial + (h * (cut->parts - 1) + part - 1) * cut->partial_size;
   if (cut->by_queries) r.first_query = before, r.queries = min64(cut->part_rows, r.queries - before);
@@ -284,33 +290,36 @@ static backward_range find_range(const backward_job *job, int64_t index) {
   return r;
 }
 
-static ast_status backward_task(int64_t index, void *context) {
-  backward_job *job = context;
-  const backward_range r = find_range(job, index);
+static ast_status attention_backward_task(int64_t index, void *context) {
+  attention_backward_job *job = context;
+  const attention_backward_range r = attention_find_backward_range(job, index);
   const int64_t D = job->s->D;
-  if (r.keys == 0) fill_rows(0, r.dq_stride, r.queries, D, r.dq);
-  if (r.queries == 0) fill_rows(0, r.dk_stride, r.keys, D, r.dk), fill_rows(0, r.dv_stride, r.keys, D, r.dv);
+  if (r.keys == 0) attention_fill_rows(0, r.dq_stride, r.queries, D, r.dq);
+  if (r.queries == 0)
+    attention_fill_rows(0, r.dk_stride, r.keys, D, r.dk), attention_fill_rows(0, r.dv_stride, r.keys, D, r.dv);
   if (r.keys == 0 || r.queries == 0) return AST_OK;
-  backward_scratch *t = ast_scratch(sizeof *t);
+  attention_backward_scratch *t = ast_scratch(sizeof *t);
   if (!t) return AST_NO_MEMORY;
   const dropout d = dropout_of(job->s, r.b, r.h);
+  t->scale = attention_scale_of_scores(job->s->scale);
   for (int64_t i = 0; i < r.queries; i += CHUNK) {
     const int64_t rows = min64(CHUNK, r.queries - i), first = r.first_query + i;
-    load_queries(job, &r, first, rows, t);
+    attention_load_queries(job, &r, first, rows, t);
     for (int64_t k0 = 0; k0 < r.keys; k0 += KEYS)
-      backward_block(job, &r, first, rows, r.first_key + k0, min64(KEYS, r.keys - k0), &d, t);
-    put_rows(t->dq, rows, D, job->s->scale, false, r.dq + i * r.dq_stride, r.dq_stride);
-    put_peaks(job, &r, first, rows, t);
+      attention_backward_block(job, &r, first, rows, r.first_key + k0, min64(KEYS, r.keys - k0), &d, t);
+    attention_put_rows(t->dq, rows, D, attention_scale_of_queries(job->s->scale), false, r.dq + i * r.dq_stride,
+                       r.dq_stride);
+    attention_put_peaks(job, &r, first, rows, t);
   }
   return AST_OK;
 }
 
 /* Scene index / H and head index % H: adds the partial gradients to what the first part left, and settles the peaks. */
-static ast_status finish_task(int64_t index, void *context) {
-  const backward_job *job = context;
+static ast_status attention_finish_backward_task(int64_t index, void *context) {
+  const attention_backward_job *job = context;
   const ast_attention *s = job->s;
   const int64_t D = s->D, h = index % s->H;
-  const backward_cut *cut = job->cuts + index / s->H;
+  const attention_backward_cut *cut = job->cuts + index / s->H;
   for (int64_t part = 1; part < cut->parts; part++) {
     const float *partial = job->partials + cut->first_partial + (h * (cut->parts - 1) + part - 1) * cut->partial_size;
     for (int64_t i = 0; i < cut->partial_size / D; i++, partial += D) {
@@ -321,7 +330,7 @@ static ast_status finish_task(int64_t index, void *context) {
       for (int64_t e = 0; e < D; e += VW) vstore(to + e, vload(to + e) + vload(partial + e));
     }
   }
-  if (job->any_peaks) settle_peaks(job, cut, h);
+  if (job->any_peaks) attention_settle_peaks(job, cut, h);
   return AST_OK;
 }
 
@@ -330,22 +339,24 @@ static ast_status attention_backward(const ast_attention *s, const float *restri
                                      const float *restrict sum, const float *restrict dout, float *restrict dq,
                                      float *restrict dk, float *restrict dv) {
   AST_SCRATCH_SCOPE;
-  backward_cut *cuts = ast_scratch(s->B * (int64_t)sizeof *cuts);
+  attention_backward_cut *cuts = ast_scratch(s->B * (int64_t)sizeof *cuts);
   int64_t *first_task = ast_scratch((s->B + 1) * (int64_t)sizeof *first_task), floats = 0, num_peaks = 0;
   if (!cuts || !first_task) return AST_NO_MEMORY;
   first_task[0] = 0;
   for (int64_t b = 0; b < s->B; b++) {
-    cuts[b] = cut_backward(s, b);
+    cuts[b] = attention_cut_backward(s, b);
     cuts[b].first_partial = floats;
     cuts[b].first_peak = num_peaks;
     first_task[b + 1] = first_task[b] + s->H * cuts[b].parts;
     floats += s->H * (cuts[b].parts - 1) * cuts[b].partial_size;
     num_peaks += s->H * cuts[b].peaks;
   }
-  backward_peak *peaks = ast_scratch(num_peaks * (int64_t)sizeof *peaks);
+  attention_backward_peak *peaks = ast_scratch(num_peaks * (int64_t)sizeof *peaks);
   float *partials = ast_scratch(floats * (int64_t)sizeof *partials);
   if (!peaks || !partials) return AST_NO_MEMORY;
-  backward_job job = {s, q, k, v, out, maximum, sum, dout, dq, dk, dv, cuts, first_task, partials, peaks, false};
-  const ast_status status = ast_parallel(first_task[s->B], backward_task, &job);
-  return status == AST_OK && (floats || job.any_peaks) ? ast_parallel(s->B * s->H, finish_task, &job) : status;
+  attention_backward_job job = {s,  q,  k,  v,    out,        maximum,  sum,   dout,
+                                dq, dk, dv, cuts, first_task, partials, peaks, false};
+  const ast_status status = ast_parallel(first_task[s->B], attention_backward_task, &job);
+  return status == AST_OK && (floats || job.any_peaks) ? ast_parallel(s->B * s->H, attention_finish_backward_task, &job)
+                                                       : status;
 }

@@ -18,7 +18,7 @@
  * N nodes, E elements. About 350 operations an element forward, 80 of them in double, and 530 in a direction, on 4 x 24
  * bytes of coordinates: arithmetic is the limit. VW elements are computed at once: their corners are transposed into
  * one vector per coordinate, and the forces back into 16 floats per element. Then each node adds the forces of its
- * corners in stored order, so that the result depends on neither threads nor batch.
+ * corners in stored order, by chains whose sums are added by halves, so that the result depends on neither threads nor batch.
  */
 #include "ast.h"
 #include "simd.h"
@@ -26,6 +26,7 @@
 enum {
   ELASTIC_ELEMENTS = 2048, /* elements a task: large enough to pay for the hand-over */
   ELASTIC_NODES = 2048,    /* nodes a task */
+  ELASTIC_CHAIN = 256,     /* corners of one chain of a sum at most: its rounding errors grow with their number */
   CORNERS = 16             /* floats of the corners of an element: 4 x (x, y, z, unused) */
 };
 
@@ -223,13 +224,22 @@ static ast_status elastic_force_task(int64_t index, void *context) {
   return AST_OK;
 }
 
+/* The sum of some corners, chains of them added by halves. */
+static corner elastic_sum(const elastic_job *job, int64_t begin, int64_t end) {
+  if (end - begin > ELASTIC_CHAIN) {
+    const int64_t middle = half_of_chains(begin, end, ELASTIC_CHAIN);
+    return elastic_sum(job, begin, middle) + elastic_sum(job, middle, end);
+  }
+  corner sum = {0};
+  for (int64_t j = begin; j < end; j++) sum += *(const corner *)(job->forces + 4 * job->mesh->node_order[j]);
+  return sum;
+}
+
 static ast_status elastic_sum_task(int64_t index, void *context) {
   const elastic_job *job = context;
   const ast_elastic *mesh = job->mesh;
   for (int64_t n = index * ELASTIC_NODES; n < min64(mesh->N, (index + 1) * ELASTIC_NODES); n++) {
-    corner sum = {0};
-    for (int64_t j = mesh->node_offsets[n]; j < mesh->node_offsets[n + 1]; j++)
-      sum += *(const corner *)(job->forces + 4 * mesh->node_order[j]);
+    const corner sum = elastic_sum(job, mesh->node_offsets[n], mesh->node_offsets[n + 1]);
     for (int i = 0; i < 3; i++) job->out[3 * n + i] = sum[i];
   }
   return AST_OK;

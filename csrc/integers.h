@@ -11,6 +11,11 @@ static inline int64_t max64(int64_t a, int64_t b) { return a > b ? a : b; }
 static inline int64_t divide_up(int64_t n, int64_t by) { return (n + by - 1) / by; }
 static inline int64_t round_up(int64_t n, int64_t to) { return divide_up(n, to) * to; }
 
+/* Between begin and end, of whose more than `chain` numbers each half has whole chains but for the last. */
+static inline int64_t half_of_chains(int64_t begin, int64_t end, int64_t chain) {
+  return begin + divide_up(end - begin, chain) / 2 * chain;
+}
+
 /* The number of bits of n. */
 static inline int num_bits(uint64_t n) { return n ? 64 - __builtin_clzll(n) : 0; }
 

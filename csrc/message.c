@@ -9,8 +9,8 @@
  *
  * Edges are sorted by receiver. A task owns a range of receivers with about the same number of edges as any other and
  * goes through them in tiles of MESSAGE_TILE edges, whose h, x and y stay in the second-level cache; while it
- * multiplies, it fetches the rows of P of the next tile. Sums run in stored order, a chain of MESSAGE_CHAIN edges of a
- * receiver after the other, and a row of a product does not depend on its neighbours in a tile, so neither tiles, tasks,
+ * multiplies, it fetches the rows of P of the next tile. Sums run in stored order, by chains of MESSAGE_CHAIN edges of a
+ * receiver, and a row of a product does not depend on its neighbours in a tile, so neither tiles, tasks,
  * threads nor other scenes of a batch change a bit.
  *
  * Cost per edge: 2 (E H + H F + F F2) flops, a row of P read from anywhere in memory, rows of e, of Q and of the sum in
@@ -112,11 +112,16 @@ static void message_layers(const message_weights *w, int64_t first, int64_t n, c
   dense_all(&w->layers[MESSAGE_W2], n, (gemm_a){t->x, w->row, 1}, (dense_end){.out = t->y, .out_row = w->row});
 }
 
-/* A sum over more than MESSAGE_CHAIN edges goes chain by chain. Whether one ends with the edge `done` of `all`, counted
- * from 1; then it is added to the sum of n channels, and the next one begins with 0. */
-AST_INLINE bool message_chain_ends(int64_t done, int64_t all) { return done % MESSAGE_CHAIN == 0 || done == all; }
 static void message_end_chain(int64_t n, float *restrict chain, float *restrict sum) {
   for (int64_t c = 0; c < n; c++) sum[c] += chain[c], chain[c] = 0;
+}
+
+/* A sum of n channels over more than MESSAGE_CHAIN edges goes chain by chain, their sums again by chains of that many:
+ * chains [2,n] hold what is not added so far. This comes behind the edge `done` of `all`, counted from 1. */
+AST_INLINE void message_end_chains(int64_t done, int64_t all, int64_t n, float *chains, float *sum) {
+  if (done % MESSAGE_CHAIN && done < all) return;
+  message_end_chain(n, chains, chains + n);
+  if (done % (MESSAGE_CHAIN * MESSAGE_CHAIN) == 0 || done == all) message_end_chain(n, chains + n, sum);
 }
 
 /* ---- forward ---- */
@@ -127,22 +132,22 @@ typedef struct {
   float *sum, *messages;
 } message_job;
 
-/* The messages of edges first.., from y, and the sums of their receivers, with the chain of one with many edges. */
-AST_INLINE void message_out(const message_job *job, int64_t first, int64_t n, float *y, float *chain,
+/* The messages of edges first.., from y, and the sums of their receivers, with the chains of one with many edges. */
+AST_INLINE void message_out(const message_job *job, int64_t first, int64_t n, float *y, float *chains,
                             const bool whole) {
   const ast_message *step = job->w.step;
   const int64_t F2 = step->F2;
   for (int64_t m = first; m < first + n; m++, y += job->w.row) {
     const float scale = norm_centre(y, F2, whole);
     const int64_t *offsets = step->receiver_offsets + step->receivers[m], edges = offsets[1] - offsets[0];
-    float *total = job->sum + step->receivers[m] * F2, *sum = edges > MESSAGE_CHAIN ? chain : total;
+    float *total = job->sum + step->receivers[m] * F2, *sum = edges > MESSAGE_CHAIN ? chains : total;
     for (int64_t c = 0; c < F2; c += VW) {
       const int64_t lanes = whole ? VW : F2 - c;
       const vf out = norm_out(scale * vload(y + c), step->gamma, step->beta, c, lanes);
       vstore_upto(sum + c, vload_upto(sum + c, lanes) + out, lanes);
       if (job->messages) vstore_upto(job->messages + m * F2 + c, out, lanes);
     }
-    if (sum == chain && message_chain_ends(m + 1 - offsets[0], edges)) message_end_chain(F2, chain, total);
+    if (sum == chains) message_end_chains(m + 1 - offsets[0], edges, F2, chains, total);
   }
 }
 
@@ -155,15 +160,15 @@ static ast_status message_task(int64_t index, void *context) {
                           : step->R;
   const int64_t last = step->receiver_offsets[end];
   message_tile t;
-  float *chain = ast_scratch(step->F2 * (int64_t)sizeof *chain);
-  if (!chain || !message_new_tile(&job->w, &t)) return AST_NO_MEMORY;
-  memset(chain, 0, (size_t)step->F2 * sizeof *chain);
+  float *chains = ast_scratch(2 * step->F2 * (int64_t)sizeof *chains);
+  if (!chains || !message_new_tile(&job->w, &t)) return AST_NO_MEMORY;
+  memset(chains, 0, (size_t)(2 * step->F2) * sizeof *chains);
   memset(job->sum + begin * step->F2, 0, (size_t)((end - begin) * step->F2) * sizeof *job->sum);
   for (int64_t m = step->receiver_offsets[begin]; m < last; m += MESSAGE_TILE) {
     const int64_t n = min64(MESSAGE_TILE, last - m);
     message_layers(&job->w, m, n, &t);
-    if (step->F2 % VW) message_out(job, m, n, t.y, chain, false);
-    else message_out(job, m, n, t.y, chain, true);
+    if (step->F2 % VW) message_out(job, m, n, t.y, chains, false);
+    else message_out(job, m, n, t.y, chains, true);
   }
   return AST_OK;
 }

@@ -30,12 +30,12 @@ enum {
 /* The gradients that are sums over all edges; dA1 is transposed, [E,H]. */
 enum { MESSAGE_DW2, MESSAGE_DA2, MESSAGE_DA1, MESSAGE_DB2, MESSAGE_DGAMMA, MESSAGE_DBETA, MESSAGE_Da1, MESSAGE_SUMS };
 
-/* The sums over the edges of each of some nodes. One of more than MESSAGE_CHAIN edges has a chain of its own. */
+/* The sums over the edges of each of some nodes. One of more than MESSAGE_CHAIN edges has chains of its own. */
 typedef struct {
   float *sums;         /* [nodes, F] */
-  int64_t *chain_of;   /* [nodes]: the number of its chain, or -1 */
-  int64_t *all, *done; /* [chains]: edges of the node, and how many of them are added */
-  float *chains;       /* [chains, F] */
+  int64_t *chains_of;  /* [nodes]: the number of such a node, or -1 */
+  int64_t *all, *done; /* of each such node: its edges, and how many of them are added */
+  float *chains;       /* [such nodes, 2, F] */
 } message_node_sums;
 
 typedef struct {
@@ -129,20 +129,20 @@ static ast_status message_backward_task(int64_t index, void *context) {
   return AST_OK;
 }
 
-/* Sums of nodes, of which sums->chain_of counts the edges so far. */
+/* Sums of nodes, of which sums->chains_of counts the edges so far. */
 static bool message_new_sums(const ast_message *step, int64_t nodes, message_node_sums *sums) {
   int64_t num = 0;
-  for (int64_t i = 0; i < nodes; i++) num += sums->chain_of[i] > MESSAGE_CHAIN;
+  for (int64_t i = 0; i < nodes; i++) num += sums->chains_of[i] > MESSAGE_CHAIN;
   sums->all = ast_scratch(2 * num * (int64_t)sizeof *sums->all);
-  sums->chains = ast_scratch(num * step->F * (int64_t)sizeof *sums->chains);
+  sums->chains = ast_scratch(2 * num * step->F * (int64_t)sizeof *sums->chains);
   if (!sums->all || !sums->chains) return false;
   sums->done = sums->all + num;
   memset(sums->done, 0, (size_t)num * sizeof *sums->done);
-  memset(sums->chains, 0, (size_t)(num * step->F) * sizeof *sums->chains);
+  memset(sums->chains, 0, (size_t)(2 * num * step->F) * sizeof *sums->chains);
   num = 0;
   for (int64_t i = 0; i < nodes; i++) {
-    const int64_t edges = sums->chain_of[i];
-    sums->chain_of[i] = edges > MESSAGE_CHAIN ? num : -1;
+    const int64_t edges = sums->chains_of[i];
+    sums->chains_of[i] = edges > MESSAGE_CHAIN ? num : -1;
     if (edges > MESSAGE_CHAIN) sums->all[num++] = edges;
   }
   return true;
@@ -156,17 +156,17 @@ static bool message_new_all_sums(message_backward_job *job) {
   for (int64_t m = 0; m < step->M; m++) of_senders[step->senders[m]]++;
   int64_t *of_receivers = of_senders + step->S;
   for (int64_t r = 0; r < step->R; r++) of_receivers[r] = step->receiver_offsets[r + 1] - step->receiver_offsets[r];
-  job->dP = (message_node_sums){.sums = job->out->of_senders, .chain_of = of_senders};
-  job->dQ = (message_node_sums){.sums = job->out->of_receivers, .chain_of = of_receivers};
+  job->dP = (message_node_sums){.sums = job->out->of_senders, .chains_of = of_senders};
+  job->dQ = (message_node_sums){.sums = job->out->of_receivers, .chains_of = of_receivers};
   return message_new_sums(step, step->S, &job->dP) && message_new_sums(step, step->R, &job->dQ);
 }
 
 /* forward: z += P[sender] + Q[receiver] */
 AST_INLINE void message_add_row(const message_node_sums *sums, int64_t node, int64_t F, const float *dz) {
-  const int64_t chain = sums->chain_of[node];
-  float *sum = sums->sums + node * F, *to = chain < 0 ? sum : sums->chains + chain * F;
+  const int64_t number = sums->chains_of[node];
+  float *sum = sums->sums + node * F, *to = number < 0 ? sum : sums->chains + 2 * number * F;
   for (int64_t c = 0; c < F; c += VW) vstore_upto(to + c, vload_upto(to + c, F - c) + vload(dz + c), F - c);
-  if (chain >= 0 && message_chain_ends(++sums->done[chain], sums->all[chain])) message_end_chain(F, to, sum);
+  if (number >= 0) message_end_chains(++sums->done[number], sums->all[number], F, to, sum);
 }
 
 /* dP of the senders of a part; the first round clears them before. */

@@ -10,12 +10,13 @@ static PyObject *call_kernel(PyObject *self, PyObject *const *objects, Py_ssize_
   call c = {.spec = &b->spec};
   PyObject *result = NULL;
   ast_status status;
-  if (take(&c, objects, num) && (!b->check || b->check(&c))) {
+  if (call_take(&c, objects, num) && (!b->check || b->check(&c))) {
     if (!b->count) {
-      if (run(&c, b->run, NULL, &status)) Py_INCREF(result = Py_None);
+      if (call_run(&c, b->run, NULL, &status) && (status == AST_OK || call_fail(&c, ast_status_text(status))))
+        Py_INCREF(result = Py_None);
     } else if ((result = PyList_New(0)) && !b->count(&c, result)) Py_CLEAR(result);
   }
-  release(&c);
+  call_release(&c);
   return result;
 }
 

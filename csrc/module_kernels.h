@@ -28,14 +28,14 @@
   }                                                                                 \
   static ast_status name##_body(const name##_arguments *a, UNUSED const int64_t *n, UNUSED void *result)
 
-/* EACH(MACRO, x, y, ...) is MACRO(x), MACRO(y), ... for up to 16 names. */
-#define EACH(MACRO, ...)       AGAIN(EACH_OF(MACRO, __VA_ARGS__))
-#define EACH_OF(MACRO, x, ...) MACRO(x) __VA_OPT__(, NEXT_OF PARENTHESES(MACRO, __VA_ARGS__))
-#define NEXT_OF()              EACH_OF
-#define PARENTHESES            ()
-#define AGAIN(...)             AGAIN_4(AGAIN_4(AGAIN_4(AGAIN_4(__VA_ARGS__))))
-#define AGAIN_4(...)           AGAIN_1(AGAIN_1(AGAIN_1(AGAIN_1(__VA_ARGS__))))
-#define AGAIN_1(...)           __VA_ARGS__
+/* LIST_OF(MACRO, x, y, ...) is MACRO(x), MACRO(y), ... for up to 16 names. */
+#define LIST_OF(MACRO, ...)      AGAIN(LIST_FROM(MACRO, __VA_ARGS__))
+#define LIST_FROM(MACRO, x, ...) MACRO(x) __VA_OPT__(, LIST_NEXT PARENTHESES(MACRO, __VA_ARGS__))
+#define LIST_NEXT()              LIST_FROM
+#define PARENTHESES              ()
+#define AGAIN(...)               AGAIN_4(AGAIN_4(AGAIN_4(AGAIN_4(__VA_ARGS__))))
+#define AGAIN_4(...)             AGAIN_1(AGAIN_1(AGAIN_1(AGAIN_1(__VA_ARGS__))))
+#define AGAIN_1(...)             __VA_ARGS__
 /* Members of a struct of the core that have the name of a size or of a parameter, or of x where that is dx. */
 #define SIZE(letter)   .letter = n[(int)*#letter]
 #define FIELD(name)    .name = a->name.data
@@ -44,14 +44,14 @@
 typedef ast_status (*run_function)(const argument *a, const int64_t *n, void *result);
 
 /* Calls a kernel without the interpreter's lock; false with an exception set if there was no memory. */
-static bool run(call *c, run_function function, void *result, ast_status *status) {
+static bool call_run(call *c, run_function function, void *result, ast_status *status) {
   *status = AST_OK;
-  if (begin(c)) {
+  if (call_begin(c)) {
     Py_BEGIN_ALLOW_THREADS;
     *status = function(c->arguments, c->size, result);
     Py_END_ALLOW_THREADS;
   }
-  return end(c, *status);
+  return call_end(c, *status);
 }
 
 /* ---- sums of rows ---- */
@@ -79,7 +79,7 @@ PARAMETERS(elastic_inputs, ELASTIC);
 
 static ast_elastic elastic_of(const void *arguments, const int64_t *n) {
   const elastic_inputs_arguments *a = arguments;
-  return (ast_elastic){EACH(SIZE, N, E), EACH(FIELD, ELASTIC)};
+  return (ast_elastic){LIST_OF(SIZE, N, E), LIST_OF(FIELD, ELASTIC)};
 }
 
 KERNEL(elastic_forces, ELASTIC, force) {
@@ -97,7 +97,7 @@ KERNEL(elastic_forces_backward, dforce, ELASTIC, dposition) {
 #define PROXIMITY position, motion, offsets, body, surface, surface_offsets
 
 KERNEL(proximity, PROXIMITY, radius, out) {
-  const ast_proximity s = {EACH(SIZE, B, N, F), EACH(FIELD, PROXIMITY), .radius = a->radius.number};
+  const ast_proximity s = {LIST_OF(SIZE, B, N, F), LIST_OF(FIELD, PROXIMITY), .radius = a->radius.number};
   return kernels->proximity(&s, a->out.data);
 }
 
@@ -107,7 +107,7 @@ static bool proximity_check(const call *c) {
   bool finite = true;
   for (int64_t i = 0; i < 3 * c->size['N']; i++) finite &= isfinite((double)position[i] + (double)motion[i]);
   return (finite && a->radius.number > 0 && isfinite(a->radius.number)) ||
-         fail(c, "position, motion and radius must be finite, and the radius positive");
+         call_fail(c, "position, motion and radius must be finite, and the radius positive");
 }
 
 /* ---- the order of nodes ---- */
@@ -131,7 +131,7 @@ static bool mesh_edges_count(call *c, PyObject *list) {
   const mesh_edges_arguments *a = (const void *)c->arguments;
   ast_status status;
   c->size['M'] = 2 * c->size['P'] * c->size['E']; /* room; pages that stay empty take no memory */
-  if (!make_outputs(c) || !run(c, mesh_edges_run, NULL, &status)) return false;
+  if (!make_outputs(c) || !call_run(c, mesh_edges_run, NULL, &status)) return false;
   c->size['M'] = ((const int64_t *)a->offsets.data)[c->size['N']];
   return append_outputs(c, list);
 }
@@ -144,7 +144,7 @@ static bool outer_faces_count(call *c, PyObject *list) {
   ast_status status;
   int64_t num = 0;
   c->size['F'] = c->size['E'] * c->size['Q'];
-  if (!make_outputs(c) || !run(c, outer_faces_run, &num, &status)) return false;
+  if (!make_outputs(c) || !call_run(c, outer_faces_run, &num, &status)) return false;
   c->size['F'] = num;
   return append_outputs(c, list);
 }
@@ -163,7 +163,7 @@ static bool octree_check(const call *c) {
   const octree_arguments *a = (const void *)c->arguments;
   bool finite = a->half_width.number > 0 && a->half_width.number < 1e300;
   for (const argument *x = &a->x; x <= &a->z; x++) finite &= x->number > -1e300 && x->number < 1e300;
-  return finite || fail(c, "half_width must be positive, and it and center finite");
+  return finite || call_fail(c, "half_width must be positive, and it and center finite");
 }
 
 static bool octree_count(call *c, PyObject *list) {
@@ -171,9 +171,9 @@ static bool octree_count(call *c, PyObject *list) {
   ast_status status;
   int64_t bad = 0;
   c->size['C'] = c->size['N']; /* room for a cell a node */
-  if (!make_outputs(c) || !run(c, octree_run, &bad, &status)) return false;
+  if (!make_outputs(c) || !call_run(c, octree_run, &bad, &status)) return false;
   if (status != AST_OK)
-    return PyErr_Format(PyExc_ValueError, "octree: positions[%lld] is not a point of the domain", (long long)bad),
+    return PyErr_Format(PyExc_ValueError, "octree: positions[%lld]: %s", (long long)bad, ast_status_text(status)),
            false;
   c->size['C'] = ((const int64_t *)a->cell_offsets.data)[c->size['B']];
   return append_outputs(c, list);
@@ -188,7 +188,7 @@ KERNEL(octree_coarsen, keys, cell_offsets, levels, coarse_keys, coarse_offsets, 
   return kernels->octree_coarsen(a->keys.data, a->cell_offsets.data, n['B'], (int)a->levels.integer, result);
 }
 
-static ast_status write_level(const argument *arguments, UNUSED const int64_t *n, void *result) {
+static ast_status octree_coarsen_write(const argument *arguments, UNUSED const int64_t *n, void *result) {
   const octree_coarsen_arguments *a = (const void *)arguments;
   const ast_octree_level *level = result;
   memcpy(a->pair_offsets.data, level->pair_offsets, sizeof level->pair_offsets);
@@ -204,13 +204,13 @@ static bool octree_coarsen_count(call *c, PyObject *list) {
   AST_SCRATCH_SCOPE; /* of the levels */
   ast_octree_level level[21];
   ast_status status;
-  bool ok = run(c, octree_coarsen_run, level, &status);
-  if (ok && status == AST_TOO_LARGE) ok = fail(c, "keys must be fewer than 2^31");
+  bool ok = call_run(c, octree_coarsen_run, level, &status);
+  if (ok && status == AST_TOO_LARGE) ok = call_fail(c, ast_status_text(status));
   for (int j = 0; ok && j < levels; j++) {
     c->size['N'] = level[j].C_fine;
     c->size['C'] = level[j].C;
     c->size['P'] = level[j].pair_offsets[27];
-    ok = make_outputs(c) && run(c, write_level, &level[j], &status) && append_outputs(c, list);
+    ok = make_outputs(c) && call_run(c, octree_coarsen_write, &level[j], &status) && append_outputs(c, list);
   }
   return ok;
 }
@@ -234,8 +234,8 @@ static bool farthest_point_sample_count(call *c, PyObject *list) {
   const int64_t points = c->size['C'], scenes = c->size['B'], num = a->num.integer;
   ast_status status;
   c->size['S'] = scenes && num <= (points - 1) / scenes ? scenes * num : points; /* room */
-  if (!make_outputs(c) || !run(c, farthest_point_sample_run, NULL, &status)) return false;
-  if (status != AST_OK) return fail(c, "coordinates of a scene differ by 2^21 or more");
+  if (!make_outputs(c) || !call_run(c, farthest_point_sample_run, NULL, &status)) return false;
+  if (status != AST_OK) return call_fail(c, ast_status_text(status));
   c->size['S'] = ((const int64_t *)a->out_offsets.data)[scenes];
   return append_outputs(c, list);
 }
@@ -262,43 +262,41 @@ PARAMETERS(attention_rest, ATTENTION, dout);
 /* Queries, keys and values, which may lie beside each other in one array, or their gradients. */
 typedef struct {
   argument q, k, v;
-} tokens;
+} attention_tokens;
 
-static argument part(const argument *a, int64_t i, const int64_t *n) {
+static argument attention_part(const argument *a, int64_t i, const int64_t *n) {
   argument x = *a;
   x.data = (float *)a->data + i * n['H'] * n['D'];
   return x;
 }
 
-static tokens of_kv(const argument *q, const argument *key_value, const int64_t *n) {
-  return (tokens){*q, part(key_value, 0, n), part(key_value, 1, n)};
+static attention_tokens attention_of_kv(const argument *q, const argument *key_value, const int64_t *n) {
+  return (attention_tokens){*q, attention_part(key_value, 0, n), attention_part(key_value, 1, n)};
 }
 
-static tokens of_qkv(const argument *qkv, const int64_t *n) { return (tokens){*qkv, part(qkv, 1, n), part(qkv, 2, n)}; }
+static attention_tokens attention_of_qkv(const argument *qkv, const int64_t *n) {
+  return (attention_tokens){*qkv, attention_part(qkv, 1, n), attention_part(qkv, 2, n)};
+}
 
 static bool attention_check(const call *c) {
   const int64_t D = c->size['D'];
-  return (D % 16 == 0 && D >= 16 && D <= 128) || fail(c, "the head dimension must be a multiple of 16 up to 128");
+  return (D % 16 == 0 && D >= 16 && D <= 128) || call_fail(c, "the head dimension must be a multiple of 16 up to 128");
 }
 
-static ast_attention attention_of(const tokens *x, const attention_rest_arguments *a, const int64_t *n) {
-  return (ast_attention){EACH(SIZE, B, H, D),
-                         EACH(FIELD, q_offsets, k_offsets),
-                         .q_stride = x->q.row_stride,
-                         .k_stride = x->k.row_stride,
-                         .v_stride = x->v.row_stride,
-                         .scale = (float)a->scale.number,
-                         .dropout_p = a->dropout_p.number,
-                         .seed = (uint64_t)a->seed.integer};
+static ast_attention attention_of(const attention_tokens *x, const attention_rest_arguments *a, const int64_t *n) {
+  return (ast_attention){LIST_OF(SIZE, B, H, D),           LIST_OF(FIELD, q_offsets, k_offsets),
+                         .q_stride = x->q.row_stride,      .k_stride = x->k.row_stride,
+                         .v_stride = x->v.row_stride,      .scale = (float)a->scale.number,
+                         .dropout_p = a->dropout_p.number, .seed = (uint64_t)a->seed.integer};
 }
 
-static ast_status attend(tokens x, const void *rest, const int64_t *n) {
+static ast_status attention_call(attention_tokens x, const void *rest, const int64_t *n) {
   const attention_rest_arguments *a = rest;
   const ast_attention s = attention_of(&x, a, n);
   return kernels->attention(&s, x.q.data, x.k.data, x.v.data, a->out.data, a->maximum.data, a->total.data);
 }
 
-static ast_status attend_backward(tokens x, const void *rest, tokens d, const int64_t *n) {
+static ast_status attention_call_backward(attention_tokens x, const void *rest, attention_tokens d, const int64_t *n) {
   const attention_rest_arguments *a = rest;
   ast_attention s = attention_of(&x, a, n);
   s.dq_stride = d.q.row_stride;
@@ -308,22 +306,26 @@ static ast_status attend_backward(tokens x, const void *rest, tokens d, const in
                                      a->dout.data, d.q.data, d.k.data, d.v.data);
 }
 
-KERNEL(attention, q, k, v, ATTENTION) { return attend((tokens){a->q, a->k, a->v}, &a->q_offsets, n); }
+KERNEL(attention, q, k, v, ATTENTION) { return attention_call((attention_tokens){a->q, a->k, a->v}, &a->q_offsets, n); }
 
-KERNEL(attention_kv, q, key_value, ATTENTION) { return attend(of_kv(&a->q, &a->key_value, n), &a->q_offsets, n); }
+KERNEL(attention_kv, q, key_value, ATTENTION) {
+  return attention_call(attention_of_kv(&a->q, &a->key_value, n), &a->q_offsets, n);
+}
 
-KERNEL(attention_qkv, qkv, ATTENTION) { return attend(of_qkv(&a->qkv, n), &a->q_offsets, n); }
+KERNEL(attention_qkv, qkv, ATTENTION) { return attention_call(attention_of_qkv(&a->qkv, n), &a->q_offsets, n); }
 
 KERNEL(attention_backward, q, k, v, ATTENTION, dout, dq, dk, dv) {
-  return attend_backward((tokens){a->q, a->k, a->v}, &a->q_offsets, (tokens){a->dq, a->dk, a->dv}, n);
+  return attention_call_backward((attention_tokens){a->q, a->k, a->v}, &a->q_offsets,
+                                 (attention_tokens){a->dq, a->dk, a->dv}, n);
 }
 
 KERNEL(attention_kv_backward, q, key_value, ATTENTION, dout, dq, dkey_value) {
-  return attend_backward(of_kv(&a->q, &a->key_value, n), &a->q_offsets, of_kv(&a->dq, &a->dkey_value, n), n);
+  return attention_call_backward(attention_of_kv(&a->q, &a->key_value, n), &a->q_offsets,
+                                 attention_of_kv(&a->dq, &a->dkey_value, n), n);
 }
 
 KERNEL(attention_qkv_backward, qkv, ATTENTION, dout, dqkv) {
-  return attend_backward(of_qkv(&a->qkv, n), &a->q_offsets, of_qkv(&a->dqkv, n), n);
+  return attention_call_backward(attention_of_qkv(&a->qkv, n), &a->q_offsets, attention_of_qkv(&a->dqkv, n), n);
 }
 
 /* ---- message passing ---- */
@@ -334,13 +336,14 @@ PARAMETERS(message_inputs, MESSAGE);
 
 static ast_message message_of(const void *arguments, const int64_t *n) {
   const message_inputs_arguments *a = arguments;
-  return (ast_message){EACH(SIZE, M, S, R, E, H, F), .F2 = n['G'], EACH(FIELD, MESSAGE)};
+  return (ast_message){LIST_OF(SIZE, M, S, R, E, H, F), .F2 = n['G'], LIST_OF(FIELD, MESSAGE)};
 }
 
 /* Without an encoder edge features are added to of_senders and of_receivers; none at all are [M, 0]. */
 static bool message_check(const call *c) {
   const int64_t E = c->size['E'];
-  return c->size['H'] || !E || E == c->size['F'] || fail(c, "edge_features without an encoder have other channels");
+  return c->size['H'] || !E || E == c->size['F'] ||
+         call_fail(c, "edge_features without an encoder have other channels");
 }
 
 KERNEL(message, MESSAGE, sum, messages) {
@@ -351,7 +354,7 @@ KERNEL(message, MESSAGE, sum, messages) {
 KERNEL(message_backward, dsum, dmessages, MESSAGE, dof_senders, dof_receivers, dedge_features, dA1, da1, dA2, dW2, db2,
        dgamma, dbeta) {
   const ast_message s = message_of(&a->of_senders, n);
-  const ast_message_gradients gradients = {EACH(GRADIENT, MESSAGE_FLOATS)};
+  const ast_message_gradients gradients = {LIST_OF(GRADIENT, MESSAGE_FLOATS)};
   return kernels->message_backward(&s, a->dsum.data, a->dmessages.data, &gradients);
 }
 
@@ -386,8 +389,8 @@ PARAMETERS(mlp_inputs, MLP);
 
 static ast_mlp mlp_of(const void *arguments, const int64_t *n) {
   const mlp_inputs_arguments *a = arguments;
-  return (ast_mlp){EACH(SIZE, M, I, H, O), .I2 = n['J'], .x_stride = a->x.row_stride,
-                   .beside_stride = a->beside.row_stride, EACH(FIELD, MLP)};
+  return (ast_mlp){LIST_OF(SIZE, M, I, H, O), .I2 = n['J'], .x_stride = a->x.row_stride,
+                   .beside_stride = a->beside.row_stride, LIST_OF(FIELD, MLP)};
 }
 
 #define MLP_KEPT hidden, normalized, scale
@@ -395,14 +398,14 @@ static ast_mlp mlp_of(const void *arguments, const int64_t *n) {
 KERNEL(mlp, MLP, residual, out, MLP_KEPT) {
   ast_mlp s = mlp_of(a, n);
   s.residual_stride = a->residual.row_stride;
-  return kernels->mlp(&s, a->residual.data, a->out.data, (ast_mlp_kept){EACH(FIELD, MLP_KEPT)});
+  return kernels->mlp(&s, a->residual.data, a->out.data, (ast_mlp_kept){LIST_OF(FIELD, MLP_KEPT)});
 }
 
 KERNEL(mlp_backward, dout, MLP, MLP_KEPT, dx, dbeside, dweight1, dbias1, dweight2, dbias2, dgamma, dbeta) {
   ast_mlp s = mlp_of(&a->x, n);
   s.dout_stride = a->dout.row_stride;
-  return kernels->mlp_backward(&s, a->dout.data, (ast_mlp_kept){EACH(FIELD, MLP_KEPT)},
-                               (ast_mlp_gradients){EACH(GRADIENT, MLP)});
+  return kernels->mlp_backward(&s, a->dout.data, (ast_mlp_kept){LIST_OF(FIELD, MLP_KEPT)},
+                               (ast_mlp_gradients){LIST_OF(GRADIENT, MLP)});
 }
 
 /* ---- attention blocks ---- */
@@ -417,13 +420,13 @@ PARAMETERS(block_inputs, BLOCK_ROWS, BLOCK_WEIGHTS);
 
 static ast_attention_block block_of(const void *arguments, const int64_t *n) {
   const block_inputs_arguments *a = arguments;
-  return (ast_attention_block){EACH(SIZE, B, Q, K, W, C, F, H), .D = n['I'] / n['H'], EACH(FIELD, BLOCK_ROWS),
-                               EACH(FIELD, BLOCK_WEIGHTS)};
+  return (ast_attention_block){LIST_OF(SIZE, B, Q, K, W, C, F, H), .D = n['I'] / n['H'], LIST_OF(FIELD, BLOCK_ROWS),
+                               LIST_OF(FIELD, BLOCK_WEIGHTS)};
 }
 
 KERNEL(attention_block, BLOCK_ROWS, BLOCK_WEIGHTS, heads, out, BLOCK_KEPT) {
   const ast_attention_block s = block_of(a, n);
-  return kernels->attention_block(&s, a->out.data, (ast_attention_block_kept){EACH(FIELD, BLOCK_KEPT)});
+  return kernels->attention_block(&s, a->out.data, (ast_attention_block_kept){LIST_OF(FIELD, BLOCK_KEPT)});
 }
 
 KERNEL(attention_block_backward, dout, BLOCK_ROWS, BLOCK_WEIGHTS, heads, BLOCK_KEPT, dx, dcontext, dgamma, dbeta,
@@ -431,8 +434,8 @@ KERNEL(attention_block_backward, dout, BLOCK_ROWS, BLOCK_WEIGHTS, heads, BLOCK_K
        dfirst_bias, dsecond, dsecond_bias) {
   const ast_attention_block s = block_of(&a->x, n);
   return kernels->attention_block_backward(
-      &s, a->dout.data, (ast_attention_block_kept){EACH(FIELD, BLOCK_KEPT)},
-      (ast_attention_block_gradients){EACH(GRADIENT, x, context), EACH(GRADIENT, BLOCK_WEIGHTS)});
+      &s, a->dout.data, (ast_attention_block_kept){LIST_OF(FIELD, BLOCK_KEPT)},
+      (ast_attention_block_gradients){LIST_OF(GRADIENT, x, context), LIST_OF(GRADIENT, BLOCK_WEIGHTS)});
 }
 
 static bool block_check(const call *c, const void *arguments) {
@@ -440,7 +443,7 @@ static bool block_check(const call *c, const void *arguments) {
   const int64_t I = c->size['I'], H = c->size['H'], D = H ? I / H : 0;
   const bool rotated = a->rotations.data || a->context_rotations.data;
   return (H && I % H == 0 && D % 16 == 0 && D >= 16 && D <= 128 && (!rotated || c->size['E'] == D)) ||
-         fail(c, "the head dimension must be a multiple of 16 up to 128, and the dimension of the rotations");
+         call_fail(c, "the head dimension must be a multiple of 16 up to 128, and the dimension of the rotations");
 }
 
 static bool attention_block_check(const call *c) { return block_check(c, c->arguments); }

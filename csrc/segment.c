@@ -4,15 +4,16 @@
  *   column_sum:  out = sum_n x_n
  *
  * N rows n, C segments c, F channels; s_c is 1, or 1 over the rows of c. N F operations on 4 (N + C) F bytes: memory is
- * the limit. A segment is summed in the stored order, so the result depends on neither threads nor batch. The sum over
- * all rows goes by blocks of COLUMN_ROWS, whose sums are then added by halves: one chain of them would collect rounding
- * errors.
+ * the limit. One chain of sums would collect rounding errors. So a segment is summed in the stored order by chains of
+ * SEGMENT_CHAIN rows, whose sums are added by halves; the sum over all rows goes by blocks of COLUMN_ROWS likewise.
+ * Chains are counted from the first row of a segment, so the result depends on neither threads nor batch.
  */
 #include "ast.h"
 #include "simd.h"
 
 enum {
   SEGMENT_FLOATS = 1 << 15, /* floats of output a task: large enough to pay for the hand-over */
+  SEGMENT_CHAIN = 256,      /* rows of one chain of a sum at most */
   SEGMENT_VECTORS = 8,      /* sums in registers */
   SEGMENT_AHEAD = 12        /* rows by which fetching runs ahead */
 };
@@ -30,7 +31,7 @@ static segment_job segment_plan(const float *x, int64_t F, const int64_t *order,
   return (segment_job){x, F, C, max64(1, SEGMENT_FLOATS / max64(1, F)), offsets[C] - 1, order, offsets, mean, out};
 }
 
-/* `vectors` vectors of one segment from channel f on: all of a row is read at once, and rows that come later are
+/* `vectors` vectors of one chain from channel f on: all of a row is read at once, and rows that come later are
  * fetched. */
 AST_INLINE void segment_columns(const int vectors, const segment_job *job, int64_t begin, int64_t end, int64_t f,
                                 float scale, float *out) {
@@ -47,6 +48,37 @@ AST_INLINE void segment_columns(const int vectors, const segment_job *job, int64
   EACH(vectors, v) vstore(out + f + v * VW, sum[v] * scale);
 }
 
+/* out = scale times the sum of the rows begin..end, in one chain. */
+AST_INLINE void segment_chain(const segment_job *job, int64_t begin, int64_t end, float scale, float *out) {
+  const int64_t F = job->F;
+  int64_t f = 0;
+  for (; f + SEGMENT_VECTORS * VW <= F; f += SEGMENT_VECTORS * VW)
+    segment_columns(SEGMENT_VECTORS, job, begin, end, f, scale, out);
+  for (; f + 4 * VW <= F; f += 4 * VW) segment_columns(4, job, begin, end, f, scale, out);
+  for (; f + VW <= F; f += VW) segment_columns(1, job, begin, end, f, scale, out);
+  for (; f < F; f++) {
+    float sum = 0;
+    for (int64_t j = begin; j < end; j++) sum += job->x[job->order[j] * F + f];
+    out[f] = sum * scale;
+  }
+}
+
+/* out = the sum of the rows begin..end, chains of them added by halves. */
+static ast_status segment_halves(const segment_job *job, int64_t begin, int64_t end, float *out) {
+  if (end - begin <= SEGMENT_CHAIN) {
+    segment_chain(job, begin, end, 1, out);
+    return AST_OK;
+  }
+  AST_SCRATCH_SCOPE;
+  float *other = ast_scratch(job->F * (int64_t)sizeof *other);
+  if (!other) return AST_NO_MEMORY;
+  const int64_t middle = half_of_chains(begin, end, SEGMENT_CHAIN);
+  ast_status status = segment_halves(job, begin, middle, out);
+  if (status == AST_OK) status = segment_halves(job, middle, end, other);
+  for (int64_t f = 0; status == AST_OK && f < job->F; f++) out[f] += other[f];
+  return status;
+}
+
 static ast_status segment_sum_task(int64_t index, void *context) {
   const segment_job *job = context;
   const int64_t F = job->F;
@@ -54,16 +86,13 @@ static ast_status segment_sum_task(int64_t index, void *context) {
     const int64_t begin = job->offsets[c], end = job->offsets[c + 1];
     const float scale = job->mean && end > begin ? 1.0f / (float)(end - begin) : 1.0f;
     float *out = job->out + c * F;
-    int64_t f = 0;
-    for (; f + SEGMENT_VECTORS * VW <= F; f += SEGMENT_VECTORS * VW)
-      segment_columns(SEGMENT_VECTORS, job, begin, end, f, scale, out);
-    for (; f + 4 * VW <= F; f += 4 * VW) segment_columns(4, job, begin, end, f, scale, out);
-    for (; f + VW <= F; f += VW) segment_columns(1, job, begin, end, f, scale, out);
-    for (; f < F; f++) {
-      float sum = 0;
-      for (int64_t j = begin; j < end; j++) sum += job->x[job->order[j] * F + f];
-      out[f] = sum * scale;
+    if (end - begin <= SEGMENT_CHAIN) {
+      segment_chain(job, begin, end, scale, out);
+      continue;
     }
+    const ast_status status = segment_halves(job, begin, end, out);
+    if (status != AST_OK) return status;
+    for (int64_t f = 0; f < F; f++) out[f] *= scale;
   }
   return AST_OK;
 }

@@ -33,6 +33,18 @@ def wheel(tmp_path_factory) -> Path:
     return path
 
 
+def test_make_installs_system_packages_only_if_asked():
+    environment = {name: value for name, value in os.environ.items() if name != "MAKEFLAGS"}
+
+    def steps(target: str) -> str:
+        command = ["make", "--dry-run", target]
+        return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True).stdout
+
+    installing = "apt-get update"
+    assert installing not in steps("check") and installing not in steps("test") and installing in steps("install-tools")
+    assert "make install-tools" in (ROOT / ".ci" / "run").read_text()
+
+
 def test_wheel_is_one_for_all_pythons_and_whole(wheel):
     assert "-cp311-abi3-" in wheel.name
     names = set(zipfile.ZipFile(wheel).namelist())

@@ -84,6 +84,8 @@ def _scenes(q_offsets: Tensor, k_offsets: Tensor) -> Iterator[tuple[int, slice, 
 
 
 def _scores(q: Tensor, k: Tensor, scale: float) -> Tensor:
+    if abs(scale) > 1:  # scale q could overflow where the score does not
+        return torch.einsum("qhd,khd->hqk", q, k) * scale
     return torch.einsum("qhd,khd->hqk", q * scale, k)
 
 

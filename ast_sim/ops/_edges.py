@@ -6,9 +6,8 @@ Legend: M edges, S senders, R receivers; N nodes, E elements of K nodes; P edges
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from itertools import accumulate
 
 import torch
@@ -16,7 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ast_sim.element_topology import LOCAL_EDGES, LOCAL_FACES
-from ast_sim.ops.library import IndexSet, Kernel, Op, frozen
+from ast_sim.ops.library import IndexSet, Kernel, Op, frozen, is_transformed
 from ast_sim.ops.spec import check_index
 
 
@@ -63,6 +62,22 @@ def counting_sort(index: Tensor, num: int) -> tuple[Tensor, Tensor]:
     return _counting_sort(num, index)
 
 
+def _kept(make: Callable[[EdgeSet], tuple[Tensor, ...]]) -> property:
+    """A property that is computed once. While torch traces or transforms it is computed each time and not kept: such a
+    tensor may have no values afterwards."""
+    name = f"_{make.__name__}"
+
+    def value(self: EdgeSet) -> tuple[Tensor, ...]:
+        if hasattr(self, name):
+            return getattr(self, name)
+        tensors = make(self)
+        if not (torch.compiler.is_compiling() or is_transformed()):
+            self.__dict__[name] = tensors
+        return tensors
+
+    return property(value, doc=make.__doc__)
+
+
 @dataclass(frozen=True)
 class EdgeSet(IndexSet):
     """Directed edges, sorted by receiver, then by sender.
@@ -107,12 +122,12 @@ class EdgeSet(IndexSet):
     def num_receivers(self) -> int:
         return len(self.receiver_offsets) - 1
 
-    @cached_property
+    @_kept
     def by_receiver(self) -> tuple[Tensor, Tensor]:
         """The edges in stored order, and the offsets of each receiver's edges, as segment ops take them."""
         return *frozen(torch.arange(len(self), device=self.receivers.device)), self.receiver_offsets
 
-    @cached_property
+    @_kept
     def by_sender(self) -> tuple[Tensor, ...]:
         """The edges sorted by sender, and the offsets of each sender's edges, as segment ops take them."""
         return frozen(*counting_sort(self.senders, self.num_senders))

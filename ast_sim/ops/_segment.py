@@ -52,6 +52,9 @@ differentiate_by_composition(_column_sum)
 def segment_sum(x: Tensor, node_order: Tensor, node_offsets: Tensor) -> Tensor:
     """Row c is the sum of x[node_order[j]] over j in [node_offsets[c], node_offsets[c+1]), added in that order.
 
+    More than 256 rows are added by chains of that many, whose sums are added by halves, so that rounding errors do not
+    grow with the number of rows.
+
     Args:
         x: [N, F].
         node_order: [N] int64, a permutation.

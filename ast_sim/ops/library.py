@@ -263,14 +263,15 @@ def _is_batched(x) -> bool:
     return False
 
 
+def is_transformed() -> bool:
+    """Whether torch traces or transforms, so that tensors made now may have no values afterwards."""
+    functorch = torch._C._are_functorch_transforms_active()
+    return functorch or torch._C._len_torch_dispatch_stack() > 0 or torch._C._is_tracing()
+
+
 def _is_watched() -> bool:
     """Whether a mode, a transform or a tracer must see the op."""
-    return (
-        torch._C._len_torch_dispatch_stack() > 0
-        or torch._C._are_functorch_transforms_active()
-        or torch.is_autocast_enabled("cpu")
-        or torch._C._is_tracing()
-    )
+    return is_transformed() or torch.is_autocast_enabled("cpu")
 
 
 def is_at_most(size: int, most: int) -> bool:

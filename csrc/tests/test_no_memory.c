@@ -98,8 +98,9 @@ static int64_t *even_offsets(int64_t num, int64_t step) {
 }
 
 static outcome segment(const ast_kernels *kernels, bool spread) {
-  enum { F = 131, C = 300, N = 3 * C };
+  enum { F = 131, C = 300, LONG = 600, N = 3 * C + LONG };
   int64_t *offsets = even_offsets(C, 3), *order = even_offsets(N - 1, 1);
+  offsets[C] += LONG; /* rows of more than one chain */
   float *x = random_floats((spread ? C : N) * F), *out = new_floats((spread ? N : C) * F);
   return FINISH(KERNEL((spread ? kernels->segment_spread : kernels->segment_sum)(x, F, order, offsets, C, true, out)),
                 out);
@@ -500,7 +501,18 @@ static void *test_scratch(void *unused) {
   return unused;
 }
 
+/* Each status has words of its own, and what is no status has some, too. */
+static void test_texts(void) {
+  const char *texts[AST_TOO_LARGE + 2];
+  for (int i = 0; i <= AST_TOO_LARGE + 1; i++) {
+    texts[i] = ast_status_text((ast_status)i);
+    CHECK(texts[i] && *texts[i], "status %d has no text", i);
+    for (int j = 0; j < i; j++) CHECK(strcmp(texts[i], texts[j]) != 0, "statuses %d and %d have one text", j, i);
+  }
+}
+
 int main(void) {
+  test_texts();
   pthread_t thread;
   CHECK(!pthread_create(&thread, NULL, test_scratch, NULL) && !pthread_join(thread, NULL), "no thread");
   on_every_table(test);

@@ -51,6 +51,24 @@ static void sum_columns(const ast_kernels *kernels, int64_t N, int64_t F) {
   FREE(x, out);
 }
 
+static void sum_one_segment(const ast_kernels *kernels, int64_t N, int64_t F) {
+  float *x = new_floats(N * F), *out = new_floats(F);
+  int64_t *order = new_ints(N), *offsets = new_ints(2);
+  for (int64_t i = 0; i < N * F; i++) x[i] = 1 + random_float();
+  for (int64_t n = 0; n < N; n++) order[n] = N - 1 - n;
+  offsets[0] = 0;
+  offsets[1] = N;
+  READ_ONLY(x, order, offsets);
+  CHECK(kernels->segment_sum(x, F, order, offsets, 1, false, out) == AST_OK, "status");
+  for (int64_t f = 0; f < F; f++) {
+    double sum = 0;
+    for (int64_t n = 0; n < N; n++) sum += (double)x[n * F + f];
+    CHECK(fabs((double)out[f] - sum) <= 1e-6 * sum, "N %lld F %lld: %.9g, not %.9g", (long long)N, (long long)F,
+          (double)out[f], sum);
+  }
+  FREE(x, out, order, offsets);
+}
+
 static void test(const ast_kernels *kernels) {
   static const int64_t channels[] = {0, 1, 2, 3, 4, 15, 16, 17, 64, 128, 131};
   for (int f = 0; f < 11; f++)
@@ -65,6 +83,11 @@ static void test(const ast_kernels *kernels) {
   for (int f = 0; f < 11; f++)
     for (int n = 0; n < 5; n++) sum_columns(kernels, rows[n], channels[f]);
   sum_columns(kernels, 4000000, 1);
+  static const int64_t lengths[] = {255, 256, 257, 511, 512, 513, 769};
+  for (int f = 0; f < 11; f++)
+    for (int n = 0; n < 7; n++) sum_one_segment(kernels, lengths[n], channels[f]);
+  sum_one_segment(kernels, 3000000, 1);
+  sum_one_segment(kernels, 200000, 21);
 }
 
 int main(void) {

@@ -158,6 +158,14 @@ def test_no_overflow_that_the_result_does_not_have():
     assert (lse == 3e38).all()
 
 
+@pytest.mark.parametrize("scale", [1e9, -1e9])
+@pytest.mark.parametrize("p", [0.0, 0.1])
+def test_a_scale_that_would_overflow_with_the_queries_alone(scale, p):
+    """scale q is up to 1e40, the scores are about 10."""
+    q, k, v, *offsets = case([40, 3], [150, 20], 2, 48)
+    assert_accurate(fused(scale, p), composed(scale, p), [1e30 * q, 1e-38 * k, 1e-6 * v, *offsets])
+
+
 @pytest.mark.parametrize("keys", [1000, 20000])
 def test_small_values_among_many_keys_keep_their_digits(keys):
     """A power of two more or less changes no digit of the output, where weight times value is below normal numbers."""

@@ -2,8 +2,10 @@
 
 import pytest
 import torch
+from torch._subclasses.fake_tensor import FakeTensorMode
+from torch.fx.experimental.proxy_tensor import make_fx
 
-from ast_sim.ops import EdgeSet
+from ast_sim.ops import EdgeSet, segment_sum
 
 
 def test_edges_are_sorted_by_receiver_then_sender():
@@ -33,6 +35,47 @@ def test_the_orders_lie_where_the_edges_lie():
     with torch.device("meta"):
         assert [x.device.type for x in edges.by_receiver] == ["cpu", "cpu"]
     assert edges.by_receiver[0].tolist() == [0, 1, 2]
+
+
+def in_fake_mode(function):
+    def call(x):
+        with FakeTensorMode(allow_non_fake_inputs=True) as mode:
+            return function(mode.from_tensor(x))
+
+    return call
+
+
+FIRST = {
+    "grad": torch.func.grad,
+    "hessian": torch.func.hessian,
+    "vmap": lambda f: lambda x: torch.func.vmap(f)(x[None]),
+    "make_fx": lambda f: lambda x: make_fx(f)(x)(x),
+    "fake": in_fake_mode,
+    "compile": lambda f: torch.compile(f, backend="aot_eager", fullgraph=True),
+    "compiled grad": lambda f: torch.compile(torch.func.grad(f), backend="aot_eager"),
+    "compiled hessian": lambda f: torch.compile(torch.func.hessian(f), backend="aot_eager"),
+}
+
+
+@pytest.mark.parametrize("order", ["by_receiver", "by_sender"])
+@pytest.mark.parametrize("first", FIRST)
+def test_orders_have_values_after_torch_has_traced_or_transformed(first, order):
+    edges = EdgeSet.from_pairs(torch.tensor([0, 2, 1, 3]), torch.tensor([1, 0, 1, 2]), 4, 3)
+    again = EdgeSet.from_pairs(torch.tensor([0, 2, 1, 3]), torch.tensor([1, 0, 1, 2]), 4, 3)
+    wanted = [x.tolist() for x in getattr(again, order)]
+
+    def squares(of):
+        return lambda x: (segment_sum(x, *getattr(of, order)) ** 2).sum()
+
+    torch._dynamo.reset()
+    x = torch.randn(4, 3)
+    result, same = FIRST[first](squares(edges))(x), FIRST[first](squares(again))(x)
+    assert [type(x) for x in getattr(edges, order)] == [torch.Tensor, torch.Tensor]
+    assert [x.tolist() for x in getattr(edges, order)] == wanted
+    assert getattr(edges, order) is getattr(edges, order)
+    assert torch.equal(segment_sum(x, *getattr(edges, order)), segment_sum(x, *getattr(again, order)))
+    if first != "fake":
+        torch.testing.assert_close(result, same)
 
 
 def test_no_edges_and_wrong_indices():

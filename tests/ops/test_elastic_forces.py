@@ -97,6 +97,15 @@ def test_uniaxial_stretch_of_a_unit_tetrahedron_by_hand():
     torch.testing.assert_close(elastic_forces(UNIT * torch.tensor([2.0, 1.0, 1.0]), UNIT, lame, turned), expected)
 
 
+def test_a_node_of_a_million_elements():
+    """One chain of sums would be off by 1e-4: the forces are equal, and each addition is rounded the same way."""
+    num = 1_000_000
+    one, many = (TetrahedronSet.from_elements(torch.arange(4).expand(n, 4).clone(), 4) for n in (1, num))
+    stretched = UNIT * torch.tensor([2.3, 1.7, 1.1])
+    force, forces = (elastic_forces(stretched, UNIT, torch.ones(len(x), 2), x) for x in (one, many))
+    torch.testing.assert_close(forces.double(), num * force.double(), rtol=1e-5, atol=0)
+
+
 def test_a_cube_pulled_uniaxially_pulls_back_with_the_stress_on_its_faces():
     rest, elements = box(4, 4, 4)
     tets, lame = TetrahedronSet.from_elements(elements, len(rest)), torch.tensor([[1.0, 0.5]]).expand(len(elements), 2)

@@ -119,6 +119,27 @@ def test_column_sum(rows, channels):
         segment.column_sum(x[None])
 
 
+@pytest.mark.parametrize("channels", [3, 44])
+def test_a_million_rows_of_one_segment(channels):
+    """Of values that do not cancel, where one long chain of sums would be off by 2e-5 (the sum, the mean, and the
+    gradient of what is spread over the rows)."""
+    rows, one = torch.arange(1_000_000), torch.tensor([0, 1_000_000])
+    x = 1 + torch.rand(len(rows), channels)
+    sums = x.double().sum(0)
+    spread = torch.zeros(1, channels, requires_grad=True)
+    (gradient,) = torch.autograd.grad(segment.segment_spread(spread, rows, one), spread, x)
+    for result in (segment_sum(x, rows, one), segment_mean(x, rows, one) * len(rows), gradient):
+        torch.testing.assert_close(result[0].double(), sums, rtol=1e-6, atol=0)
+
+
+def test_chains_are_counted_within_a_segment():
+    """Rows before and behind a segment, and those of other segments, change none of its bits."""
+    x = 1 + torch.rand(2000, 20)
+    alone = segment_sum(x, torch.arange(2000), torch.tensor([0, 2000]))
+    batch = torch.cat([torch.rand(100, 20), x, torch.rand(700, 20)])
+    assert torch.equal(segment_sum(batch, torch.arange(2800), torch.tensor([0, 100, 2100, 2800]))[1:2], alone)
+
+
 def test_column_sum_of_a_million_rows():
     """Of values that do not cancel, where one long chain of sums would collect rounding errors."""
     assert_accurate(segment.column_sum, lambda x: x.sum(0), [torch.rand(1_000_000, 3)])
