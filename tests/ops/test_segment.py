@@ -133,7 +133,7 @@ def test_a_million_rows_of_one_segment(channels):
 
 
 def test_chains_are_counted_within_a_segment():
-    """Rows before and behind a segment, and those of other segments, change none of its bits."""
+    """Rows before and behind a segment change none of its bits."""
     x = 1 + torch.rand(2000, 20)
     alone = segment_sum(x, torch.arange(2000), torch.tensor([0, 2000]))
     batch = torch.cat([torch.rand(100, 20), x, torch.rand(700, 20)])
