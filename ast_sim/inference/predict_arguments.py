@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from ast_sim.importers.scene_mesh import SceneMesh
-from ast_sim.inference.predicting.question import Frames, Question, fields_of
+from ast_sim.inference.predicting.question import Question, WantedFrames, fields_of
 from ast_sim.models.model_config import ModelConfig
 from ast_sim.named_field import STRESS, require_fields
 from ast_sim.number_arrays import ranges
@@ -28,7 +28,7 @@ def new_question(
     motion: Motions | None,
     num_frames: int | None,
     name: str,
-    frames: Frames | None,
+    frames: WantedFrames | None,
     stress: np.ndarray | None = None,
     notes: tuple[str, ...] = (),
 ) -> Question:

@@ -22,7 +22,7 @@ from ast_sim.inference.effort import Effort, EffortErrors, error_with
 from ast_sim.inference.evaluation.evaluate import evaluate
 from ast_sim.inference.evaluation.evaluated_run import Evaluation
 from ast_sim.inference.predict_arguments import Motions, new_question
-from ast_sim.inference.predicting.question import Frames, Question
+from ast_sim.inference.predicting.question import Question, WantedFrames
 from ast_sim.inference.promises.calibration import Calibration
 from ast_sim.inference.promises.chosen_effort import ErrorLimit, chosen_effort
 from ast_sim.inference.sweep import Sweep, sweep
@@ -127,7 +127,7 @@ class Run:
         spec: str | os.PathLike[str] | None = None,
         parameters: Mapping[str, Any] | None = None,
         nodes: int | None = None,
-        frames: Frames | None = None,
+        frames: WantedFrames | None = None,
         effort: Effort | None = None,
         error: ErrorLimit | None = None,
         ms: float | None = None,
@@ -217,7 +217,7 @@ class Run:
         scenes: Iterable[tuple[Scene, Motions]],
         *,
         names: Sequence[str] | None = None,
-        frames: Frames | None = None,
+        frames: WantedFrames | None = None,
         effort: Effort | None = None,
         error: ErrorLimit | None = None,
         num_frames: int | None = None,
@@ -242,7 +242,7 @@ class Run:
         scene: Scene,
         motions: Iterable[Motions],
         *,
-        frames: Frames | None = None,
+        frames: WantedFrames | None = None,
         effort: Effort | None = None,
         error: ErrorLimit | None = None,
         num_frames: int | None = None,

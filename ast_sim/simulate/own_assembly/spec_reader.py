@@ -23,7 +23,7 @@ from ast_sim.simulate.own_assembly.assembly_spec import (
 )
 from ast_sim.simulate.own_assembly.expressions import FUNCTIONS, Expression
 from ast_sim.simulate.own_assembly.parameters import Parameter, parameter, plain
-from ast_sim.simulate.own_assembly.spec_table import Table, Vector
+from ast_sim.simulate.own_assembly.spec_table import Table, VectorExpression
 from ast_sim.support.disk import read_text
 from ast_sim.support.errors import ConfigError, nearest_name
 
@@ -232,7 +232,7 @@ def _move(table: Table, rigid: bool) -> Move:
     return _rigid_motion(table, where, path)
 
 
-def _rigid_motion(table: Table, places: tuple[Place, ...], path: tuple[Vector, ...] | None) -> Move:
+def _rigid_motion(table: Table, places: tuple[Place, ...], path: tuple[VectorExpression, ...] | None) -> Move:
     axis, point = table.vector("axis", [0, 0, 1]), table.vector("point", [0, 0, 0])
     rotation = table.number("rotation", 0)
     still = Table({"still": [0, 0, 0]}, table.place).path("still")
