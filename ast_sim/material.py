@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from numbers import Real
 
 import numpy as np
 
+from ast_sim.support.argument_checks import in_short, require_type, several
 from ast_sim.support.errors import ConfigError
 
 YOUNG, POISSON, FRICTION = "young", "poisson", "friction"
@@ -22,10 +25,24 @@ class Material:
         columns: the name of each column of `Scene.material`: "young" (Young's modulus in pascal), "poisson" (Poisson's
             ratio), "friction", or what else the data have.
         constants: numbers that are the same in all elements of all scenes, by name. A column wins over a constant.
+
+    Raises:
+        ConfigError: names are no texts, or two are equal; or a constant is no number.
     """
 
     columns: tuple[str, ...] = ()
     constants: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        names = several("columns", self.columns, "names, such as ['young', 'poisson']")
+        require_type("constants", self.constants, Mapping, "numbers by name, such as {'poisson': 0.3}")
+        for name in names:
+            require_type("the name of a column", name, str, "a text")
+        if len(set(names)) != len(names):
+            raise ConfigError(f"two columns of the material have one name: {', '.join(names)}")
+        for name, value in self.constants.items():
+            if isinstance(value, bool) or not isinstance(value, Real) or not math.isfinite(value):
+                raise ConfigError(f"{name} of a material is {in_short(value)}; it must be a number")
 
     @property
     def yields(self) -> bool:

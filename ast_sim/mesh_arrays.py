@@ -18,7 +18,8 @@ from ast_sim.number_arrays import (
     require_nodes,
     whole_numbers,
 )
-from ast_sim.support.errors import DatasetError
+from ast_sim.support.argument_checks import in_short, several
+from ast_sim.support.errors import ConfigError, DatasetError
 
 if TYPE_CHECKING:
     import meshio
@@ -57,7 +58,7 @@ def scene_arrays(
     require_array(name, "node_type", types, np.uint8, (count,))
     if handles is not None:
         types[_nodes(name, handles, count)] = NodeType.HANDLE
-    for number in obstacles:
+    for number in several("obstacles", obstacles, "the numbers of bodies, such as [1]"):
         types[nodes_of_body(parts, number)] = NodeType.OBSTACLE
     columns = None if material is None else real_numbers(name, "material", material)
     if columns is not None and columns.ndim == 1:
@@ -76,8 +77,12 @@ def _nodes(name: str, handles: Any, count: int) -> np.ndarray:
     return nodes
 
 
-def joined_arrays(scenes: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """The arrays of one scene, from the arrays of several; errors are as in `Scene.join`."""
+def joined_arrays(given: Sequence[Any]) -> dict[str, Any]:
+    """The arrays of one scene, from several scenes; errors are as in `Scene.join`."""
+    for scene in given:
+        if not hasattr(scene, "rest_position"):
+            raise ConfigError(f"a scene to join is {in_short(scene)}; it must be a Scene")
+    scenes: list[Mapping[str, Any]] = [vars(scene) for scene in given]
     kinds = {
         (scene["elements"].shape[1], 0 if scene["material"] is None else scene["material"].shape[1]) for scene in scenes
     }
@@ -101,6 +106,8 @@ def joined_arrays(scenes: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 def arrays_of_mesh(mesh: meshio.Mesh) -> tuple[Any, np.ndarray, dict[str, Any]]:
     """Points, cells, and the fields of the scene that the mesh has; errors are as in `Scene.from_meshio`."""
+    if not hasattr(mesh, "cells"):
+        raise DatasetError(f"the mesh is {in_short(mesh)}; it must be a mesh of meshio")
     blocks = [index for index, block in enumerate(mesh.cells) if len(block.data)]
     kinds = sorted({mesh.cells[index].type for index in blocks})
     if len(kinds) != 1 or kinds[0] not in CELL_KINDS.values():

@@ -9,7 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from ast_sim.support.argument_checks import in_short, several
 from ast_sim.support.errors import ConfigError, DatasetError
+from ast_sim.support.toml_settings import whole
 
 # Elements from which the search for connected parts makes pairs of nodes at a time. This limits its memory.
 _ELEMENTS_AT_ONCE = 1 << 13
@@ -53,6 +55,8 @@ def whole_numbers(name: str, array: str, value: Any, dtype: type) -> np.ndarray:
 
 
 def _as_array(name: str, array: str, value: Any) -> np.ndarray:
+    if isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value):
+        raise DatasetError(f"{name}: {array} has masked numbers: fill them, or leave out what they belong to")
     try:
         return np.asarray(value)
     except ValueError as error:  # rows of different lengths
@@ -80,8 +84,9 @@ def nodes_of_body(body: np.ndarray, number: int) -> np.ndarray:
     """[N] bool: the nodes of the body with this number; `body` [N] is as in `Scene`.
 
     Raises:
-        ConfigError: there is no such body; the text names the existing bodies.
+        ConfigError: it is no whole number, or there is no such body; the text names the existing bodies.
     """
+    (number,) = whole(body=number)
     nodes = body == number
     if not nodes.any():
         numbers, counts = np.unique(body, return_counts=True)
@@ -93,6 +98,8 @@ def nodes_of_body(body: np.ndarray, number: int) -> np.ndarray:
 
 def require_array(name: str, array: str, value: np.ndarray, dtype: type, shape: tuple[int | None, ...]) -> None:
     """Raise DatasetError unless `value` has the dtype and the shape; None in `shape` allows any size."""
+    if not isinstance(value, np.ndarray):
+        raise DatasetError(f"{name}: {array} must be an array of {np.dtype(dtype)}, not {in_short(value)}")
     if value.dtype != dtype:
         raise DatasetError(f"{name}: {array} must be {np.dtype(dtype)}, not {value.dtype}")
     fits = len(value.shape) == len(shape) and all(w in (None, s) for s, w in zip(value.shape, shape, strict=True))
@@ -117,6 +124,18 @@ def require_finite(name: str, array: str, row: str, value: np.ndarray, first_fra
         *frame, index, _ = np.unravel_index(np.argmin(finite), finite.shape)
         at = f"in frame {first_frame + frame[0]} at {row} {index}" if frame else f"of {row} {index}"
         raise DatasetError(f"{name}: {array} {at} is not finite: {value[*frame, index].tolist()}")
+
+
+def ascending(name: str, numbers: Any) -> list[int]:
+    """Whole numbers, each once, from the smallest to the largest.
+
+    Raises:
+        ConfigError: one is no whole number, or there is none; the text names the argument `name`.
+    """
+    chosen = {whole(**{name: number})[0] for number in several(name, numbers, "whole numbers")}
+    if not chosen:
+        raise ConfigError(f"{name} is empty: name at least one")
+    return sorted(chosen)
 
 
 def ranges(numbers: Iterable[int]) -> str:

@@ -10,9 +10,11 @@ from itertools import pairwise
 
 import numpy as np
 
-from ast_sim.number_arrays import nodes_of_body
+from ast_sim.number_arrays import nodes_of_body, real_numbers
 from ast_sim.scene import Scene
+from ast_sim.support.argument_checks import require_type
 from ast_sim.support.errors import ConfigError
+from ast_sim.support.toml_settings import whole
 
 Vector = Sequence[float]
 
@@ -167,7 +169,10 @@ class Motion:
             ConfigError: `frames` is below 2, or the positions would take more than `MOST_BYTES`; there is no such body,
                 or the body has no prescribed node.
         """
-        if frames < 2:
+        require_type("scene", scene, Scene, "a Scene")
+        require_type("motions", motions, Mapping, "the motion of each body by its number, such as {1: (0, 0, -0.01)}")
+        (frames,) = whole(frames=frames)
+        if frames is None or frames < 2:
             raise ConfigError(f"a motion needs at least 2 frames, not {frames}")
         needed = frames * scene.rest_position.nbytes
         if needed > MOST_BYTES:
@@ -192,8 +197,9 @@ class Motion:
 
         Raises:
             ConfigError: the shape is another one, or a number is not finite.
+            DatasetError: these are no numbers.
         """
-        position = np.asarray(position, np.float32)
+        position = real_numbers("the motion", "position", position)
         p = int(scene.prescribed.sum())
         if position.ndim == 3 and position.shape[1:] == (p, 3) and p < scene.num_nodes:
             whole = np.repeat(scene.rest_position[None], len(position), axis=0)

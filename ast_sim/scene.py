@@ -12,8 +12,9 @@ import numpy as np
 from ast_sim.element_topology import LOCAL_EDGES, surface_triangles, unique_edges
 from ast_sim.mesh_arrays import NodeType, arrays_of_mesh, joined_arrays, mesh_of_arrays, require_mesh, scene_arrays
 from ast_sim.named_field import NamedField
-from ast_sim.number_arrays import ranges, require_array, require_finite, require_nodes
+from ast_sim.number_arrays import ascending, ranges, require_array, require_finite, require_nodes
 from ast_sim.scene_summary import scene_drawing, scene_facts
+from ast_sim.support.argument_checks import require_type
 from ast_sim.support.errors import DatasetError
 from ast_sim.support.notebook_table import html_table, one_line
 
@@ -82,7 +83,7 @@ class Scene:
         Raises:
             DatasetError: the elements have different numbers of nodes, or the materials different columns.
         """
-        return cls(**joined_arrays([vars(scene) for scene in scenes]))
+        return cls(**joined_arrays(scenes))
 
     @classmethod
     def from_meshio(cls, mesh: meshio.Mesh, **changes: Any) -> Scene:
@@ -268,7 +269,7 @@ class Trajectory:
         Raises:
             DatasetError: a frame is missing; the text names the frames that are there.
         """
-        chosen = sorted(set(frames))
+        chosen = ascending("frames", frames)
         missing = [number for number in chosen if number not in self.numbers]
         if missing:
             raise DatasetError(f"there is no frame {missing[0]}; there are the frames {ranges(self.numbers)}")
@@ -312,6 +313,7 @@ class Trajectory:
         require_finite(name, "position", "node", self.position)
         self._check_numbering(name)
         for key, one in self.fields.items():
+            require_type(f"{name}: the field {key}", one, NamedField, "a NamedField")
             one.check(name, key, self.num_frames, n, e)
         if stress_location is not None and (self.stress is None) != (stress_location == "none"):
             what = "no stress" if self.stress is None else "stress"
@@ -339,7 +341,8 @@ class Trajectory:
                 continue
             if len(values) != self.num_frames:
                 raise DatasetError(f"{name}: {what} has {len(values)} numbers for {self.num_frames} frames")
-            if not np.isfinite(values).all() or (np.diff(values) <= 0).any():
+            are_numbers = np.asarray(values).dtype.kind in "iuf"
+            if not are_numbers or not np.isfinite(values).all() or (np.diff(values) <= 0).any():
                 raise DatasetError(f"{name}: {what} must be finite and ascend: {list(values)}")
         if self.frames is not None and self.frames[0] < 0:
             raise DatasetError(f"{name}: frames starts at {self.frames[0]}; the first frame of a motion is 0")

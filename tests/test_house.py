@@ -81,6 +81,26 @@ def test_a_name_means_one_thing():
     assert not [name for name, count in names.items() if count > 1]
 
 
+def kinds(source: str) -> list[str]:
+    """The names of public classes, and of types that are made of others, such as `Json = dict[str, Any]`."""
+    tree = ast.parse(source)
+    names = [node.name for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
+    assigned = (target for node in tree.body if isinstance(node, ast.Assign) for target in node.targets)
+    names += [target.id for target in assigned if isinstance(target, ast.Name)]
+    return [name for name in names if re.fullmatch(r"[A-Z]\w*[a-z]\w*", name)]
+
+
+def test_a_class_has_a_name_of_its_own():
+    """A reader who looks for a name in the package finds one class; private ones, seen in one module, do not count."""
+    source = "class Pair: 0\nclass _Own: 0\nJson = dict[str, int]\nMOST = 3\nname = 4\n__all__ = []\nOther = Pair"
+    assert kinds(source) == ["Pair", "Json", "Other"]
+    places: dict[str, list[str]] = {}
+    for path in MODULE_FILES:
+        for name in kinds(path.read_text(encoding="utf-8")):
+            places.setdefault(name, []).append(path.relative_to(ROOT).as_posix())
+    assert not {name: files for name, files in places.items() if len(files) > 1}
+
+
 def test_test_modules_have_names_of_their_own():
     """Pytest imports a test module by the name of its file alone: of two with one name, the second is an error."""
     tests = Path(__file__).parent

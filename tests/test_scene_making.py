@@ -158,9 +158,9 @@ def test_bodies_to_start_from_have_their_sizes():
 def test_sizes_and_cells_must_be_above_zero():
     with pytest.raises(ConfigError, match=r"the box has the size \[1, 0, 1\]; every size must be above 0"):
         ast_sim.box((0, 0, 0), (1, 0, 1), (1, 1, 1))
-    with pytest.raises(ConfigError, match=r"the plate has \[2, 0, 1\] cells; must be whole numbers above 0"):
+    with pytest.raises(ConfigError, match=r"the plate has \[2, 0, 1\] cells; must be three whole numbers above 0"):
         ast_sim.plate((1, 1, 1), (2, 0, 1))
-    with pytest.raises(ConfigError, match=r"the ball has \[3\] cells; must be even whole numbers above 0"):
+    with pytest.raises(ConfigError, match=r"the ball has \[3\] cells; must be an even whole number above 0"):
         ast_sim.ball((0, 0, 0), 1, 3)
     with pytest.raises(ConfigError, match="the axis of the cylinder is 'w'; must be x, y or z"):
         ast_sim.cylinder((0, 0, 0), 1, 1, 4, axis="w")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
@@ -13,7 +12,9 @@ import h5py
 import numpy as np
 
 from ast_sim.material import FRICTION, POISSON, YOUNG, Material
+from ast_sim.number_arrays import real_numbers
 from ast_sim.scene import AttributeValue, Scene
+from ast_sim.support.argument_checks import in_short, require_type
 from ast_sim.support.errors import DatasetError
 
 FORMAT = "ast_sim"
@@ -89,8 +90,16 @@ class DatasetInfo:
         ):
             if getattr(self, key) not in allowed:
                 raise DatasetError(f"{name}: {key} is {getattr(self, key)!r}; must be one of {', '.join(allowed)}")
-        numbers = (*self.domain_center, self.domain_half_width, self.contact_radius, self.time_step)
-        if len(self.domain_center) != 3 or not all(map(math.isfinite, numbers)):
+        if not isinstance(self.family, str) or not self.family:
+            raise DatasetError(f"{name}: family is {in_short(self.family)}; must be a text")
+        if not isinstance(self.generator, Mapping):
+            raise DatasetError(f"{name}: generator is {in_short(self.generator)}; must be facts by name")
+        center = real_numbers(name, "domain_center", self.domain_center)
+        sizes = ("domain_half_width", "contact_radius", "time_step")
+        numbers = [real_numbers(name, key, getattr(self, key)) for key in sizes]
+        if center.shape != (3,) or any(one.shape for one in numbers):
+            raise DatasetError(f"{name}: domain_center must be three numbers; {', '.join(sizes)} must be one each")
+        if not all(np.isfinite(one).all() for one in (center, *numbers)):
             raise DatasetError(f"{name}: domain_center, domain_half_width, contact_radius and time_step must be finite")
         if self.domain_half_width <= 0 or self.contact_radius < 0 or self.time_step < 0:
             raise DatasetError(f"{name}: domain_half_width must be above 0, contact_radius and time_step at least 0")
@@ -101,7 +110,7 @@ class DatasetInfo:
         Raises:
             DatasetError: there is no such unit; the text names `name`.
         """
-        if unit not in LENGTH_UNITS:
+        if unit not in tuple(LENGTH_UNITS):  # a list has no hash
             raise DatasetError(f"{name}: length_unit {unit!r} is unknown: use one of {', '.join(LENGTH_UNITS)}")
         scale = LENGTH_UNITS[self.length_unit] / LENGTH_UNITS[unit]
         center_x, center_y, center_z = self.domain_center
@@ -169,6 +178,8 @@ def write_attributes(group: h5py.Group | h5py.Dataset, values: dict[str, Any]) -
     Raises:
         DatasetError: a value has another type; the text names the attribute.
     """
+    for key in values:
+        require_type("the name of an attribute", key, str, "a text")
     for key, value in sorted(values.items()):
         if isinstance(value, str):
             # A string of fixed length is stored in the object header, which has a checksum.

@@ -11,7 +11,6 @@ import hashlib
 import os
 from collections.abc import Collection, Iterator
 from itertools import chain
-from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 import h5py
@@ -36,6 +35,7 @@ from ast_sim.material import Material
 from ast_sim.named_field import NamedField
 from ast_sim.number_arrays import require_finite
 from ast_sim.scene import AttributeValue, Scene, Trajectory
+from ast_sim.support.argument_checks import file_name
 from ast_sim.support.byte_cache import ByteCache, cache_bytes
 from ast_sim.support.errors import DatasetError
 from ast_sim.support.notebook_table import html_table, one_line
@@ -61,7 +61,7 @@ class Dataset:
     """
 
     def __init__(self, path: str | os.PathLike[str], length_unit: str | None = None) -> None:
-        self.path = Path(path)
+        self.path = file_name(path, "path")
         self._file = GuardedFile(self.path)
         try:
             stored = self._file.info()

@@ -38,7 +38,10 @@ class Split(Sequence[Trajectory]):
     def __getitem__(self, index: int | slice) -> Trajectory | Split:
         if isinstance(index, slice):
             return Split(self._dataset, self.name, self._indices[index])
-        number = self._indices[index]
+        try:
+            number = self._indices[index]
+        except IndexError as error:
+            raise IndexError(f"{self.name} has {len(self)} scenes: there is no {index}") from error
         cauchy_stress = self._dataset.cauchy_stress(self.name, number)
         fields = self._dataset.fields(self.name, number)
         return replace(self._dataset.load(self.name, number), cauchy_stress=cauchy_stress, fields=fields)

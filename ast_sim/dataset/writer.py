@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, Self
 
 import h5py
@@ -28,6 +27,7 @@ from ast_sim.dataset.layout import (
 )
 from ast_sim.named_field import require_same_fields
 from ast_sim.scene import Trajectory
+from ast_sim.support.argument_checks import file_name, require_type
 from ast_sim.support.disk import Disk, output_file, sync_folder, temporary_name
 from ast_sim.support.errors import DatasetError
 
@@ -48,8 +48,9 @@ class DatasetWriter:
     """
 
     def __init__(self, path: str | os.PathLike[str], info: DatasetInfo) -> None:
+        self.path = file_name(path, "path")
+        require_type("info", info, DatasetInfo, "a DatasetInfo")
         info.check(str(path))
-        self.path = Path(path)
         self.info = info
         self.counts = dict.fromkeys(SPLITS, 0)
         self._kind: tuple[int, int] | None = None  # (nodes per element, material width) of all trajectories
@@ -68,6 +69,8 @@ class DatasetWriter:
         """Check a trajectory and append it to the split "train", "valid", "test" or "calibration"."""
         if split not in SPLITS:
             raise DatasetError(f"{self.path}: there is no split {split!r}; use one of {', '.join(SPLITS)}")
+        require_type("trajectory", trajectory, Trajectory, "a Trajectory")
+        require_type("the attributes", trajectory.attributes, Mapping, "values by name")
         name = f"{split}/{self.counts[split]:06d}"
         trajectory.check(f"{self.path}: {name}", self.info.stress_location)
         self._kind = require_kind(f"{self.path}: {name}", trajectory.scene, self._kind)

@@ -21,6 +21,7 @@ from ast_sim.importers.series import FieldNames, read_series
 from ast_sim.plausibility.findings import Finding, refusal, told
 from ast_sim.plausibility.motion import in_trajectory
 from ast_sim.scene import Trajectory
+from ast_sim.support.argument_checks import file_name, require_bool
 from ast_sim.support.errors import DatasetError, LooksWrong, nearest_name
 from ast_sim.support.progress import Progress, ShowProgress
 
@@ -43,8 +44,11 @@ def convert(source: Path | str, out: Path | str, **options: Any) -> dict[str, in
     Raises:
         DatasetError: a file is wrong or something is missing in it; the text names the file. Nothing is written then.
     """
-    read = convert_deepmind if is_deepmind(Path(source)) else convert_series
-    return read(source, out, **options)
+    if not (source := file_name(source, "source")).exists():
+        raise DatasetError(f"{source}: there is no such file or folder")
+    require_bool(**{key: options[key] for key in ("corners", "incomplete", "strict") if key in options})
+    read = convert_deepmind if is_deepmind(source) else convert_series
+    return read(source, file_name(out, "out"), **options)
 
 
 def convert_series(
@@ -88,7 +92,7 @@ def convert_series(
         DatasetError: a file is wrong or lacks something; the text names it. Nothing is written then.
     """
     names = names or FieldNames()
-    series = find_series(source := Path(source))
+    series = find_series(source := file_name(source, "source"))
     decks = decks_of(source, series, deck, names)
     names = with_units(decks, names, length_unit)
     chosen = _assign(source, list(series), splits, calibration, seed)

@@ -12,9 +12,10 @@ import numpy as np
 from ast_sim.importers.mesh_file import MeshFile, read_mesh
 from ast_sim.importers.places import Place, parse_places
 from ast_sim.importers.solids.mesh_elements import require_extent
-from ast_sim.number_arrays import nodes_of_body
+from ast_sim.number_arrays import nodes_of_body, real_numbers
 from ast_sim.plausibility.topology import at_rest
 from ast_sim.scene import NodeType, Scene
+from ast_sim.support.argument_checks import file_name, in_short, require_bool, require_type, several
 from ast_sim.support.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -74,8 +75,13 @@ def read_scene(
         DatasetError: the file cannot be read, or a node, an element or a field is wrong; the text names the file.
         ConfigError: there is no such body, a place holds no node, a material is missing, or nothing is prescribed.
     """
+    require_bool(corners=corners)
+    if isinstance(source, str | Path):
+        source = file_name(source, "source")
+    elif not hasattr(source, "cells"):
+        raise ConfigError(f"source is {in_short(source)}; it must be the name of a file or a mesh of meshio")
     used_fields = (type_field or "node_type", body_field or "body")
-    mesh = read_mesh(Path(source) if isinstance(source, str) else source, used_fields=used_fields, corners=corners)
+    mesh = read_mesh(source, used_fields=used_fields, corners=corners)
     scene, used = mesh.scene(body_field, type_field)
     scene.check(str(mesh.path))
     require_extent(mesh.path, mesh.points[used], scene.elements)
@@ -146,7 +152,8 @@ def _node_type(
     """The types of the nodes, and warnings of clamps that hold nodes on a line only."""
     types = scene.node_type.copy()
     doubts = []
-    for clamp in clamps:
+    for clamp in several("clamps", clamps, "texts, such as ['0:xmin']"):
+        require_type("a clamp", clamp, str, "a text, such as '0:xmin'")
         held = clamped(mesh, scene, used, clamp)
         types[held] = NodeType.HANDLE
         if scene.elements.shape[1] != 3 and _on_a_line(mesh.points[used[held]]):
@@ -154,7 +161,7 @@ def _node_type(
             doubts.append(
                 f"the clamp {clamp!r} holds {len(held)} nodes, which lie on a line: body {body} could turn around it"
             )
-    for body in obstacles:
+    for body in several("obstacles", obstacles, "the numbers of bodies, such as [1]"):
         types[nodes_of_body(scene.body, body)] = NodeType.OBSTACLE
     return types, doubts
 
@@ -207,7 +214,8 @@ def _material(
     rigid = scene.rigid_bodies
     deforming = [body for body in bodies if body not in rigid]
     given = materials if isinstance(materials, Mapping) else dict.fromkeys(deforming, materials)
-    rows = {body: np.atleast_1d(np.asarray(numbers, np.float32)) for body, numbers in given.items()}
+    numbers = {body: real_numbers(str(mesh.path), "materials", one) for body, one in given.items()}
+    rows = {body: np.atleast_1d(one) for body, one in numbers.items()}
     for body in rows:
         nodes_of_body(scene.body, body)
     missing = [body for body in deforming if body not in rows]

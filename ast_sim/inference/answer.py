@@ -6,7 +6,6 @@ import io
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -19,18 +18,20 @@ from ast_sim.inference.quantities.forces_and_figures import (
     figures_of,
     force_on_driven,
     forces_on_bodies,
+    write_figures,
     write_forces,
 )
-from ast_sim.inference.quantities.relative_errors import errors_of
+from ast_sim.inference.quantities.relative_errors import errors_of, require_quantity, require_same_motion
 from ast_sim.mechanics.driven import Driven
 from ast_sim.mechanics.linearised_contact import STILL
 from ast_sim.mechanics.physics_check import Law, PhysicsCheck, check_physics
 from ast_sim.named_field import NamedField
 from ast_sim.number_arrays import percent
 from ast_sim.scene import AttributeValue, Scene, Trajectory
+from ast_sim.support.argument_checks import file_name
 from ast_sim.support.errors import AstSimError, MissingExtra, RolloutError
 from ast_sim.support.notebook_table import html_picture, html_table, one_line
-from ast_sim.view import export, picture, sweep_files
+from ast_sim.view import export, picture
 from ast_sim.view.files import make_folder
 
 if TYPE_CHECKING:
@@ -264,6 +265,7 @@ class Answer:
             quantity: "displacement": of all free nodes, in the unit of length; "reaction": of the force on `driven`, in
                 newton; "stress": of the largest stress, in pascal.
         """
+        require_quantity(quantity)
         return self.bands[quantity].around(self, quantity) if quantity in self.bands else None
 
     def errors(self, truth: Trajectory) -> dict[str, float]:
@@ -298,7 +300,7 @@ class Answer:
             ConfigError: as in `reaction`.
             AstSimError: the suffix is another one, or the file cannot be written.
         """
-        write_forces(Path(path), self.body_forces())
+        write_forces(file_name(path, "path"), self.body_forces())
 
     def check(self) -> PhysicsCheck:
         """Is it physics? Elements turned over, penetration, the forces out of balance: the worst over the computed
@@ -329,11 +331,12 @@ class Answer:
             truth: the true trajectory, if it is known; a file for ParaView then holds the errors, too.
 
         Raises:
-            AstSimError: the suffix is another one, or the file cannot be written.
+            AstSimError: the suffix or the motion of the truth is another one, or the file cannot be written.
         """
-        path = Path(path)
+        path = file_name(path, "path")
         if path.suffix not in SUFFIXES:
             raise AstSimError(f"{path}: the name of a prediction must end in one of {', '.join(SUFFIXES)}")
+        require_same_motion(self, truth)
         if self.info is None:
             raise AstSimError(f"{path}: this answer has no units: save one of Run.predict or Run.evaluate")
         make_folder(path.parent)
@@ -341,10 +344,7 @@ class Answer:
             with DatasetWriter(path, self.info) as writer:
                 writer.add("test", self.trajectory)
         elif path.suffix == ".csv":
-            origin = self.source.get("origin", [0.0, 0.0, 0.0])
-            figures = self.figures(origin if isinstance(origin, list) else [0.0, 0.0, 0.0])
-            rows = [{"frame": frame, **row} for frame, row in zip(self.frames, figures, strict=True)]
-            sweep_files.write_table(path, rows)
+            write_figures(path, self)
         else:
             shown = (self.trajectory, None) if truth is None else (truth, self.trajectory)
             export.write(path, *shown)

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, fields, replace
 from statistics import fmean
 from typing import TYPE_CHECKING, Any, Self
 
+from ast_sim.support.argument_checks import require_bool, require_type
 from ast_sim.support.errors import ConfigError
 from ast_sim.support.toml_settings import whole
 
@@ -64,7 +65,10 @@ class Effort:
         return cls(newton_steps=STEPS_BEFORE_SOLVER, solved=True)
 
     def __post_init__(self) -> None:
-        whole(0, **self._counts)
+        for name, count in zip(DIALS, whole(0, **self._counts), strict=True):
+            require_type(name, count, int, "a whole number")
+            object.__setattr__(self, name, count)
+        require_bool(solved=self.solved)
 
     @property
     def _counts(self) -> dict[str, int]:
@@ -155,6 +159,7 @@ def mean_errors(of_scenes: Sequence[Sequence[EffortErrors]]) -> list[EffortError
 def error_with(effort: Effort, measured: Sequence[EffortErrors]) -> float | None:
     """The error that was measured with this effort; with more Newton steps than were measured, the error after the
     most; None: it was not measured."""
+    require_type("effort", effort, Effort, "an Effort")
     steps = {one.effort.newton_steps: one for one in measured if _but_newton_steps(one.effort, effort)}
     nearest = steps.get(min(effort.newton_steps, max(steps, default=0)))
     return None if nearest is None else nearest.error

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
 from ast_sim.importers.scene_mesh import SceneMesh
-from ast_sim.inference.predicting.question import Frames, Question, fields_of
+from ast_sim.inference.predicting.question import Question, WantedFrames, fields_of
 from ast_sim.models.model_config import ModelConfig
 from ast_sim.named_field import STRESS, require_fields
-from ast_sim.number_arrays import ranges
+from ast_sim.number_arrays import ranges, real_numbers, require_finite
 from ast_sim.prescribed_motion import Motion, RigidMotion, Vector, frames_for
 from ast_sim.runs.scope import Scope, spacing_of
 from ast_sim.scene import Scene, Trajectory
+from ast_sim.support.argument_checks import in_short, require_type, several
 from ast_sim.support.errors import ConfigError, DatasetError
 from ast_sim.support.toml_settings import whole
 
@@ -28,7 +30,7 @@ def new_question(
     motion: Motions | None,
     num_frames: int | None,
     name: str,
-    frames: Frames | None,
+    frames: WantedFrames | None,
     stress: np.ndarray | None = None,
     notes: tuple[str, ...] = (),
 ) -> Question:
@@ -50,6 +52,7 @@ def new_question(
         scene = scene.scene
     else:
         scene = scene.scene if isinstance(scene, SceneMesh) else scene
+        require_type("scene", scene, Scene, "a Scene, a Trajectory or what read_scene returns")
         scene.check(name)
         motion = _completed(config, scope, scene, motion, num_frames, name)
         stress = _given_stress(config, scene, stress, name)
@@ -59,6 +62,23 @@ def new_question(
     _require_resolved(scene, name)
     notes = (*notes, *_loose(scene), *scope.notes(scene, motion, config.scheme.needs_each_frame))
     return Question(name, scene, motion.position, fields, movable=True, notes=notes).asking(frames)
+
+
+def scenes_of(scenes: Any, names: Any) -> list[tuple[Scene, Motions, str]]:
+    """Each scene with its motion and its name, from the arguments of `Run.predict_scenes`.
+
+    Raises:
+        ConfigError: these are no pairs, or there is another number of names.
+    """
+    pairs = several("scenes", scenes, "pairs of a scene and a motion")
+    for pair in pairs:
+        if not isinstance(pair, tuple | list) or len(pair) != 2:
+            raise ConfigError(f"scenes has {in_short(pair)}; it must be a list of pairs of a scene and a motion")
+    numbered = [f"scene {number}" for number in range(len(pairs))]
+    called = numbered if names is None else several("names", names, "texts, one for each scene")
+    if len(called) != len(pairs):
+        raise ConfigError(f"there are {len(called)} names for {len(pairs)} scenes")
+    return [(scene, motion, name) for (scene, motion), name in zip(pairs, called, strict=True)]
 
 
 def _require_resolved(scene: Scene, name: str) -> None:
@@ -132,15 +152,17 @@ def _given_stress(config: ModelConfig, scene: Scene, stress: np.ndarray | None, 
 
     Raises:
         ConfigError: its shape is not the shape of the model's stress.
+        DatasetError: these are no finite numbers.
     """
     if stress is None:
         return None
-    stress = np.asarray(stress, np.float32)
+    stress = real_numbers(name, "stress", stress)
     rows = {"node": scene.num_nodes, "element": scene.num_elements}.get(config.data.stress)
     wanted = (config.data.given_frames, rows, 1)
     if stress.shape != wanted:
         needs = "predicts none" if rows is None else f"needs {list(wanted)}"
         raise ConfigError(f"{name}: the stress has the shape {list(stress.shape)}, but the run {needs}")
+    require_finite(name, "stress", config.data.stress, stress)
     return stress
 
 

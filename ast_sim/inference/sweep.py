@@ -6,7 +6,6 @@ import os
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from ast_sim.inference.answer import Answer
@@ -16,6 +15,7 @@ from ast_sim.inference.promises.chosen_effort import ErrorLimit
 from ast_sim.mechanics.linearised_contact import STILL
 from ast_sim.models.model_config import ModelConfig
 from ast_sim.runs.scope import Scope
+from ast_sim.support.argument_checks import file_name
 from ast_sim.support.errors import ConfigError
 from ast_sim.support.progress import Progress, ShowProgress
 from ast_sim.view import sweep_files
@@ -53,7 +53,7 @@ class Sweep:
         Raises:
             AstSimError: the file cannot be written.
         """
-        make_folder(Path(path).parent)
+        make_folder(file_name(path, "path").parent)
         sweep_files.write_table(path, self.rows)
 
     def picture(self, path: str | os.PathLike[str], quantity: str = "reaction") -> None:
@@ -63,7 +63,7 @@ class Sweep:
             ConfigError: there is no such quantity, or nothing varies.
             AstSimError: the file cannot be written.
         """
-        make_folder(Path(path).parent)
+        make_folder(file_name(path, "path").parent)
         sweep_files.write_picture(path, self.rows, self.varied, quantity, self.length_unit)
 
 

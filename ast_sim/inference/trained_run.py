@@ -7,7 +7,6 @@ import os
 import time
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,8 +20,8 @@ from ast_sim.inference.assembly_questions import ask
 from ast_sim.inference.effort import Effort, EffortErrors, error_with
 from ast_sim.inference.evaluation.evaluate import evaluate
 from ast_sim.inference.evaluation.evaluated_run import Evaluation
-from ast_sim.inference.predict_arguments import Motions, new_question
-from ast_sim.inference.predicting.question import Frames, Question
+from ast_sim.inference.predict_arguments import Motions, new_question, scenes_of
+from ast_sim.inference.predicting.question import Question, WantedFrames
 from ast_sim.inference.promises.calibration import Calibration
 from ast_sim.inference.promises.chosen_effort import ErrorLimit, chosen_effort
 from ast_sim.inference.sweep import Sweep, sweep
@@ -30,11 +29,13 @@ from ast_sim.number_arrays import percent
 from ast_sim.runs import run_file
 from ast_sim.scene import Scene, Trajectory
 from ast_sim.simulate.own_assembly.grid import grid, read_table
+from ast_sim.support.argument_checks import file_name, require_bool, several
 from ast_sim.support.errors import ConfigError, RolloutError
 from ast_sim.support.notebook_table import html_table, one_line
 from ast_sim.support.progress import Progress, ShowProgress
 from ast_sim.support.provenance import provenance
 from ast_sim.support.toml_settings import NOTHING, whole
+from ast_sim.view.page import check_suffix
 
 
 class Run:
@@ -59,14 +60,13 @@ class Run:
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
-        self.path = Path(path)
+        self.path = file_name(path, "path")
         self.folder = run_file.open_run(self.path)
         self.settings, self.scope = self.folder.settings, self.folder.scope
         self.model = self.folder.load_model()
         self.step = self.folder.chosen.step
         answers = self.folder.chosen.answers
-        unset = {"corrections": self.settings.train.corrections}
-        self.effort = Effort(**answers.get("effort", unset))
+        self.effort = Effort(**answers.get("effort", {"corrections": self.settings.train.corrections}))
         self.calibration = Calibration.of_run(self.path, answers)
         self._errors = [EffortErrors.from_json(one) for one in answers.get("valid_by_effort", [])]
 
@@ -101,7 +101,7 @@ class Run:
         Raises:
             CheckpointError: the name does not end in `.ast`, or the file cannot be written.
         """
-        run_file.write(Path(path), self.folder, self.model, licence)
+        run_file.write(file_name(path, "path"), self.folder, self.model, licence)
 
     @property
     def info(self) -> DatasetInfo:
@@ -127,7 +127,7 @@ class Run:
         spec: str | os.PathLike[str] | None = None,
         parameters: Mapping[str, Any] | None = None,
         nodes: int | None = None,
-        frames: Frames | None = None,
+        frames: WantedFrames | None = None,
         effort: Effort | None = None,
         error: ErrorLimit | None = None,
         ms: float | None = None,
@@ -217,7 +217,7 @@ class Run:
         scenes: Iterable[tuple[Scene, Motions]],
         *,
         names: Sequence[str] | None = None,
-        frames: Frames | None = None,
+        frames: WantedFrames | None = None,
         effort: Effort | None = None,
         error: ErrorLimit | None = None,
         num_frames: int | None = None,
@@ -227,12 +227,10 @@ class Run:
         """Predict several scenes, each under a motion, as one batch. `progress` is as in `generate`; errors and other
         arguments are as in `predict`."""
         began = time.perf_counter()
-        scenes = list(scenes)
-        names = [f"scene {number}" for number in range(len(scenes))] if names is None else names
         config, scope = self.settings.model, self.scope
         questions = [
             new_question(config, scope, scene, motion, num_frames, name, frames)
-            for (scene, motion), name in zip(scenes, names, strict=True)
+            for scene, motion, name in scenes_of(scenes, names)
         ]
         chosen, promises = chosen_effort(self, questions, effort, error)
         return self._answers(questions, chosen, began, throw, promises, progress)
@@ -242,7 +240,7 @@ class Run:
         scene: Scene,
         motions: Iterable[Motions],
         *,
-        frames: Frames | None = None,
+        frames: WantedFrames | None = None,
         effort: Effort | None = None,
         error: ErrorLimit | None = None,
         num_frames: int | None = None,
@@ -252,7 +250,7 @@ class Run:
     ) -> list[Answer]:
         """Predict one scene under several motions, as one batch; the answers have the order of the motions. Arguments
         and errors are as in `predict_scenes`."""
-        scenes = [(scene, motion) for motion in motions]
+        scenes = [(scene, motion) for motion in several("motions", motions, "motions, as predict takes one")]
         names = [f"{name}, motion {number}" for number in range(len(scenes))]
         shared = {"frames": frames, "effort": effort, "error": error, "num_frames": num_frames}
         return self.predict_scenes(scenes, names=names, throw=throw, progress=progress, **shared)
@@ -268,6 +266,7 @@ class Run:
     ) -> list[Answer]:
         """The answers with their units, their origin, to which `facts` of each belong, and the error that is to be
         expected. What is unusual is told as warnings; `began` is when the questions were asked."""
+        require_bool(throw=throw)
         for question in questions:
             for note in question.notes:
                 warnings.warn(f"{question.name}: {note}", stacklevel=3)
@@ -310,7 +309,7 @@ class Run:
         """
         if data is None and self.path.is_file():
             raise ConfigError(f"{self.path} holds no dataset: name one; the run learned from {self.settings.data}")
-        path = data.path if isinstance(data, Dataset) else data or self.settings.data
+        path = self.settings.data if data is None else data.path if isinstance(data, Dataset) else data
         dataset = Dataset(path, self.scope.length_unit)
         try:
             self.folder.require_fit(dataset)
@@ -347,4 +346,5 @@ class Run:
 
     def report(self, path: str | os.PathLike[str], data: str | os.PathLike[str] | Dataset | None = None) -> None:
         """Evaluate on the test split and write a page with the results."""
+        check_suffix(path)
         self.evaluate(data).report(path)

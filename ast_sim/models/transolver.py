@@ -51,7 +51,7 @@ class TransolverConfig(ProximityConfig):
         self.check_heads()
 
 
-class MLP(nn.Module):
+class GeluMLP(nn.Module):
     """Linear, GELU, Linear."""
 
     def __init__(self, inputs: int, hidden: int, outputs: int):
@@ -120,7 +120,7 @@ class TransolverBlock(nn.Module):
         self.norm = nn.LayerNorm(config.hidden)
         self.attention = PhysicsAttention(config)
         self.norm_mlp = nn.LayerNorm(config.hidden)
-        self.mlp = MLP(config.hidden, config.mlp_ratio * config.hidden, config.hidden)
+        self.mlp = GeluMLP(config.hidden, config.mlp_ratio * config.hidden, config.hidden)
 
     def forward(self, x: Tensor, offsets: Tensor) -> Tensor:
         """x [N, hidden] in the scenes of `offsets` [B + 1] -> [N, hidden]."""
@@ -141,7 +141,7 @@ class Transolver(Simulator):
         super().__init__(config)
         self.node_inputs = normalizer_of(config, "node")
         self.positions = FeatureNormalizer([("vector", 3), ("vector", 3)])
-        self.encoder = MLP(self.node_inputs.width + self.positions.width, 2 * config.hidden, config.hidden)
+        self.encoder = GeluMLP(self.node_inputs.width + self.positions.width, 2 * config.hidden, config.hidden)
         self.blocks = nn.ModuleList(TransolverBlock(config) for _ in range(config.blocks))
         self.norm = nn.LayerNorm(config.hidden)
         self.decoder = Linear(config.hidden, 3 + config.data.output_columns("node"))

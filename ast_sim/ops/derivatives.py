@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ast_sim.ops.library import LIBRARY, Kernel, Op
-from ast_sim.ops.spec import Parameter
+from ast_sim.ops.spec import Argument
 
 
 def gradient_op(op: Op, kernel: Kernel, known: dict[str, Callable[[dict], Any]] | None = None) -> Op:
@@ -78,7 +78,7 @@ def gradient_op(op: Op, kernel: Kernel, known: dict[str, Callable[[dict], Any]] 
     return gradient
 
 
-def _wanted(y: Tensor | None, p: Parameter) -> Tensor | None:
+def _wanted(y: Tensor | None, p: Argument) -> Tensor | None:
     """None for the empty tensor that stands for an output which was not wanted."""
     return None if p.optional and y is not None and y.numel() == 0 else y
 

@@ -26,7 +26,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 from torch.fx.experimental.proxy_tensor import disable_proxy_modes_tracing
 
-from ast_sim.ops.spec import Given, Parameter, Sizes, Spec, check
+from ast_sim.ops.spec import Argument, Given, Sizes, Spec, check
 
 BACKEND = os.environ.get("AST_SIM_BACKEND", "c")
 if BACKEND not in ("c", "torch"):
@@ -107,7 +107,7 @@ class Kernel:
         if reason := self._reason(self.spec.inputs, arguments):
             raise reason
 
-    def _reason(self, parameters: list[Parameter], arguments: Sequence, exact: bool = False) -> Exception | None:
+    def _reason(self, parameters: list[Argument], arguments: Sequence, exact: bool = False) -> Exception | None:
         given = {p.name: x for p, x in zip(parameters, arguments, strict=False)}
         try:
             sizes = check(self.name, parameters, given, exact)
@@ -147,7 +147,7 @@ class Kernel:
         return tuple([arguments[0].new_empty(0) if x is None else x for x in outputs])
 
 
-def dense(x: Any, p: Parameter) -> Any:
+def dense(x: Any, p: Argument) -> Any:
     """A tensor aligned and contiguous, but for rows that may lie apart; a copy only if it is not so already."""
     if not isinstance(x, Tensor) or p.shape is None:
         return x

@@ -75,7 +75,7 @@ class Dimension:
 
 
 @dataclass(frozen=True)
-class Parameter:
+class Argument:
     """One argument of an op. `shape` is None for what is no tensor."""
 
     name: str
@@ -141,7 +141,7 @@ def _require(right: object, what: str) -> None:
         raise ValueError(f"in a spec, {what}")
 
 
-def _parameters(text: str, output: bool = False) -> list[Parameter]:
+def _parameters(text: str, output: bool = False) -> list[Argument]:
     parameters = []
     understood = "".join(match[0] for match in _PARAMETER.finditer(text))
     _require(understood == text, f"only {understood!r} of {text!r} can be read")
@@ -150,7 +150,7 @@ def _parameters(text: str, output: bool = False) -> list[Parameter]:
         known = dict(_WORD.findall(words))
         _require(known.keys() <= {*_WORDS, *CHECKS}, f"{name} has words that nobody knows: {words}")
         _require(dimensions or known.keys() & _SCHEMA.keys(), f"{name} has neither a shape nor a word for what it is")
-        parameters.append(Parameter(name, bool(optional), output, dimensions, known))
+        parameters.append(Argument(name, bool(optional), output, dimensions, known))
     return parameters
 
 
@@ -193,7 +193,7 @@ class Spec:
         exec("\n".join([*lines, f"    return {', '.join(expressions)},"]), namespace)
         return namespace["function"]
 
-    def _new(self, p: Parameter) -> str:
+    def _new(self, p: Argument) -> str:
         """The expression of an output without values."""
         tensors = [x for x in self.inputs if x.shape is not None]
         like = next((x for x in tensors if x.dtype == p.dtype), tensors[0])
@@ -213,7 +213,7 @@ class Spec:
                     sizes[d.single] = f"0 if {p.name} is None else {size}" if p.optional else size
         return dict.fromkeys(sorted(used), _COUNTED) | sizes
 
-    def _condition(self, p: Parameter) -> str:
+    def _condition(self, p: Argument) -> str:
         """The expression of whether an output is wanted."""
         conditions = []
         for name in p.names("if"):
@@ -227,7 +227,7 @@ class Spec:
 # ---- arguments that do not fit ----
 
 
-def check(name: str, parameters: list[Parameter], given: Given, exact: bool = False) -> Sizes:
+def check(name: str, parameters: list[Argument], given: Given, exact: bool = False) -> Sizes:
     """Raise ValueError or TypeError if these arguments do not fit, and return the sizes by letter.
 
     Parameters that are not given are not looked at. Tensors of floating point may have any dtype, unless it must be
@@ -255,7 +255,7 @@ def check(name: str, parameters: list[Parameter], given: Given, exact: bool = Fa
     return sizes
 
 
-def _check_number(name: str, p: Parameter, value: float) -> None:
+def _check_number(name: str, p: Argument, value: float) -> None:
     low, high = p.bounds
     if p.words.keys() & {"integer", "size"} and not low <= value <= high:
         raise ValueError(f"{name}: {p.name} must lie in {low}..{high}, not {value}")
@@ -263,7 +263,7 @@ def _check_number(name: str, p: Parameter, value: float) -> None:
         raise ValueError(f"{name}: {p.name} must lie in [{low}, {high}), not {value}")
 
 
-def _check_tensor(name: str, p: Parameter, x: Tensor, sizes: Sizes, exact: bool) -> None:
+def _check_tensor(name: str, p: Argument, x: Tensor, sizes: Sizes, exact: bool) -> None:
     if x.dtype != p.dtype and (exact or not (p.dtype.is_floating_point and x.dtype.is_floating_point)):
         raise TypeError(f"{name}: {p.name} must be {str(p.dtype)[6:]}, not {x.dtype}")
     shape = p.shape or ()

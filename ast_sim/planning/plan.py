@@ -18,6 +18,7 @@ from ast_sim.planning.forecast import Forecast, forecast
 from ast_sim.planning.trials import GROWTH, LONGEST, MINUTES, Trial, Trials, candidates, round_sizes
 from ast_sim.runs.config_toml import write_settings
 from ast_sim.runs.train_config import RunConfig
+from ast_sim.support.argument_checks import file_name
 from ast_sim.support.disk import write_json
 from ast_sim.support.errors import ConfigError
 from ast_sim.support.progress import Progress, ShowProgress, duration
@@ -74,7 +75,7 @@ class Plan:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write all figures as JSON."""
-        write_json(Path(path), dataclasses.asdict(self))
+        write_json(file_name(path, "path"), dataclasses.asdict(self))
 
 
 def plan(
@@ -109,7 +110,7 @@ def plan(
         DatasetError: the dataset cannot be read.
     """
     config = configure(path_of(data), preset, (), model, changes=changes_of(state, model_settings, settings))
-    return planned(config, Path(out), minutes, preset or "tiny", progress=progress)
+    return planned(config, file_name(out, "out"), minutes, preset or "tiny", progress=progress)
 
 
 def planned(

@@ -9,7 +9,6 @@ import statistics
 import time
 import warnings
 from dataclasses import dataclass
-from pathlib import Path
 
 from ast_sim.dataset.reader import Dataset
 from ast_sim.dataset.solver_seconds import read_seconds
@@ -17,6 +16,8 @@ from ast_sim.inference.effort import Effort
 from ast_sim.inference.trained_run import Run
 from ast_sim.planning.trials import MINUTES, TIMED, Trials
 from ast_sim.simulate.jobs.generate import checked_workers, generate
+from ast_sim.simulate.own_assembly.spec_reader import read_spec
+from ast_sim.support.argument_checks import file_name
 from ast_sim.support.progress import ShowProgress, duration
 from ast_sim.support.toml_settings import require_range
 from ast_sim.training.configure import configure
@@ -95,7 +96,8 @@ def worth(
         AstSimError: the specification has a mistake, or scenes cannot be solved.
     """
     require_range("minutes", minutes, *MINUTES)
-    make_folder(folder := Path(out))
+    read_spec(spec)  # a mistake in it leaves no folder
+    make_folder(folder := file_name(out, "out"))
     made = generate(
         "assembly", folder / "scenes.h5", train=SOLVED - 1, valid=1, test=0, nodes=nodes, frames=frames, solver=solver,
         spec=spec, progress=progress,

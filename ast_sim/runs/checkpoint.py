@@ -50,7 +50,7 @@ class Best(NamedTuple):
     answers: dict[str, Any]
 
 
-Content = tuple[dict[str, Tensor], dict[str, Tensor], dict[str, Any]]
+CheckpointContent = tuple[dict[str, Tensor], dict[str, Tensor], dict[str, Any]]
 
 
 def save(
@@ -90,7 +90,7 @@ def save(
     return final
 
 
-def load(path: str | os.PathLike[str], run: str | None = None) -> Content:
+def load(path: str | os.PathLike[str], run: str | None = None) -> CheckpointContent:
     """The content of a checkpoint: the arrays of the model, the arrays of the training, and the state. All is verified.
 
     With `run`, the SHA-256 in `run.json`, the checkpoint must have been saved by that run.

@@ -60,7 +60,7 @@ class MissingExtra(AstSimError, ImportError):
 def nearest_name(name: str, known: Iterable[str]) -> str:
     """An ending for a message about an unknown name: the nearest known one, or all that there are."""
     known = list(known)
-    close = difflib.get_close_matches(name, known, 1, 0.5)
+    close = difflib.get_close_matches(str(name), known, 1, 0.5)
     if close:
         return f"; did you mean {close[0]!r}?"
     return f"; there are: {', '.join(known)}" if known else "; there are none"

@@ -30,7 +30,7 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class Setting:
+class SettingHelp:
     """One setting as a user sees it: its dotted name, its type, its default (None: a value must be given), its help."""
 
     key: str
@@ -39,7 +39,7 @@ class Setting:
     help: str
 
 
-def settings(cls: type, given: Mapping[str, Any] = NOTHING) -> Iterator[Setting]:
+def settings(cls: type, given: Mapping[str, Any] = NOTHING) -> Iterator[SettingHelp]:
     """All settings of a dataclass and of its nested dataclasses, in order. A field's metadata `help` is its help.
 
     A value in `given`, by dotted key, takes the place of the default.
@@ -47,7 +47,7 @@ def settings(cls: type, given: Mapping[str, Any] = NOTHING) -> Iterator[Setting]
     for key, item, kind in _leaves(cls):
         default = given.get(key, item.default)
         shown = None if default is MISSING else _show(default)
-        yield Setting(key, _describe(kind), shown, item.metadata.get("help", ""))
+        yield SettingHelp(key, _describe(kind), shown, item.metadata.get("help", ""))
 
 
 def to_toml(obj: Any) -> str:

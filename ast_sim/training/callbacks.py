@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from ast_sim.support.argument_checks import file_name
 from ast_sim.support.errors import require
 
 Callback = Callable[[int, dict[str, float]], None]
@@ -46,7 +47,7 @@ class TensorBoard:
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
         _, board = require("tensorboard", "tensorboard", "torch.utils.tensorboard")
-        self._writer = board.SummaryWriter(os.fspath(folder))
+        self._writer = board.SummaryWriter(str(file_name(folder, "folder")))
 
     def __call__(self, step: int, figures: Mapping[str, float]) -> None:
         for name, value in figures.items():

@@ -14,6 +14,7 @@ from ast_sim.models.registry import find_preset
 from ast_sim.runs.config_toml import read_changes
 from ast_sim.runs.folder import RunFolder
 from ast_sim.runs.train_config import RunConfig, TrainConfig
+from ast_sim.support.argument_checks import file_name, require_type, several
 from ast_sim.support.errors import ConfigError, DatasetError
 from ast_sim.support.toml_settings import NONE, NOTHING, assigned, change
 
@@ -35,7 +36,7 @@ def configure(
 
     Arguments and errors are as for `train`.
     """
-    file = None if config is None else Path(config)
+    file = None if config is None else file_name(config, "config")
     given = {} if file is None else read_changes(file)
     if "train.steps" in given:  # a run that was given minutes has both
         given.pop("train.minutes", None)
@@ -47,7 +48,7 @@ def configure(
     elif model or preset:
         raise ConfigError("a run that starts from another one has its model and settings: leave model and preset out")
     else:
-        source = RunFolder(Path(from_run)).settings
+        source = RunFolder(file_name(from_run, "from_run")).settings
         settings = dataclasses.replace(source, train=dataclasses.replace(source.train, minutes=None), data=str(data))
     before = settings
     with _naming(file):
@@ -66,7 +67,7 @@ def path_of(data: str | os.PathLike[str] | Dataset) -> Path:
         DatasetError: it was opened in another unit of length than the one of the file.
     """
     if not isinstance(data, Dataset):
-        return Path(data)
+        return file_name(data, "data")
     with Dataset(data.path) as in_own_unit:
         if in_own_unit.info.length_unit != data.info.length_unit:
             raise DatasetError(f"{data.path} was opened in {data.info.length_unit}: open it without length_unit")
@@ -79,11 +80,12 @@ def changes_of(
     """The changes of settings that the arguments of `train` ask for, by dotted key.
 
     Raises:
-        ConfigError: `state` is one text.
+        ConfigError: `state` is no list, or `model_settings` no mapping.
     """
-    if isinstance(state, str):
-        raise ConfigError(f"state is {state!r}; it must be a list of names, such as [{state!r}]")
-    of_model = {**({"state": tuple(state)} if state else {}), **(model_settings or {})}
+    state = several("state", state, "names of fields, such as ['reaction']")
+    model_settings = {} if model_settings is None else model_settings
+    require_type("model_settings", model_settings, Mapping, "values by name, such as {'hidden': 32}")
+    of_model = {**({"state": tuple(state)} if state else {}), **model_settings}
     changes = {f"model.{key}": value for key, value in of_model.items()}
     return changes | {f"train.{key}": value for key, value in train_settings.items()}
 

@@ -71,7 +71,7 @@ class Saver:
         self.tell(f"starts from {start['run']}, step {start['step']:,}")
         return True
 
-    def _newest(self) -> checkpoint.Content | None:
+    def _newest(self) -> checkpoint.CheckpointContent | None:
         """The content of the newest checkpoint, which must be of this run and of this dataset."""
         path = checkpoint.latest(self.run.path)
         if path is None:

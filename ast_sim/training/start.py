@@ -23,6 +23,7 @@ from ast_sim.runs import checkpoint
 from ast_sim.runs.config_toml import has_config, write_config
 from ast_sim.runs.folder import RunFolder
 from ast_sim.runs.train_config import RunConfig
+from ast_sim.support.argument_checks import file_name, in_short, require_bool
 from ast_sim.support.errors import CheckpointError, ConfigError, TrainingError
 from ast_sim.support.progress import ShowProgress
 from ast_sim.support.stop_signals import StopSignals
@@ -78,10 +79,15 @@ def train(
         DatasetError: the dataset cannot be read.
         TrainingError, CheckpointError, KeyboardInterrupt: as in `start_training`.
     """
+    require_bool(resume=resume)
+    if callback is not None and not callable(callback):
+        raise ConfigError(f"callback is {in_short(callback)}; it must be a function of (step, figures)")
     changes = changes_of(state, model_settings, settings)
     path = path_of(data)
     chosen = configure(path, preset, (), model, config=config, from_run=from_run, changes=changes)
-    start_training(Path(out), chosen, resume=resume, from_run=from_run, callback=callback, progress=progress)
+    start_training(
+        file_name(out, "out"), chosen, resume=resume, from_run=from_run, callback=callback, progress=progress
+    )
     return Run(out)
 
 
@@ -152,7 +158,7 @@ def start_training(
         wanted = config or saved
         if wanted is None:
             raise TrainingError(f"{run} holds no run to resume: name the dataset to start one")
-        source = None if from_run is None else RunFolder(Path(from_run))
+        source = None if from_run is None else RunFolder(file_name(from_run, "from_run"))
         with Dataset(wanted.data) as dataset:
             scales = measure(dataset)
             fit = partial(resolve, dataset=dataset, scales=scales, keep_model=source is not None)

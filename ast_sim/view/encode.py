@@ -21,7 +21,7 @@ from ast_sim.view.fields import displacement_rmse, is_planar, require_same_scene
 Json = dict[str, Any]
 
 
-class Surface:
+class Boundary:
     """The boundary of a scene in two groups: the deforming bodies and the obstacles (`Scene.deforming_elements`).
 
     Each group has `triangles` [F, 3], numbers of the group's own nodes; `nodes` [n], the numbers of these nodes in the
@@ -77,7 +77,7 @@ def encode_scene(truth: Trajectory, frames: np.ndarray, predictions: Sequence[Tr
                     f"a page shows frames from the first one on, but the prediction has {ranges(prediction.numbers)}:"
                     " predict all frames"
                 )
-    surface = Surface(truth.scene)
+    surface = Boundary(truth.scene)
     low, high = _bounds(truth)
     scales = {"displacement": _displacement_range(truth, surface)}
     if truth.stress is not None and len(surface.groups["body"][1]):
@@ -173,7 +173,7 @@ def _bounds(truth: Trajectory) -> tuple[np.ndarray, np.ndarray]:
     return low - margin, high + margin
 
 
-def _displacement_range(truth: Trajectory, surface: Surface) -> Json:
+def _displacement_range(truth: Trajectory, surface: Boundary) -> Json:
     nodes = surface.groups["body"][1]
     moved = truth.position[:, nodes] - truth.scene.rest_position[nodes]
     return _color_range(np.linalg.norm(moved, axis=2), share=1.0)

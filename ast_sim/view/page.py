@@ -15,6 +15,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+from ast_sim.support.argument_checks import file_name
 from ast_sim.support.disk import replacing
 from ast_sim.support.errors import AstSimError, require
 from ast_sim.view.files import explained
@@ -26,7 +27,7 @@ FOOTER = "Made by ast_sim. This page is one file and loads nothing from anywhere
 
 def check_suffix(path: str | os.PathLike[str]) -> None:
     """Raise AstSimError if the name of a page does not say that it is HTML."""
-    if Path(path).suffix.lower() not in SUFFIXES:
+    if file_name(path, "path").suffix.lower() not in SUFFIXES:
         raise AstSimError(f"{path}: the name of a page must end in {' or '.join(SUFFIXES)}")
 
 

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from ast_sim.figures import DeepestFrames, Figures, SceneFigures, main_nodes
-
-Json = dict[str, Any]
+from ast_sim.view.encode import Json
 
 DEFAULT_UNITS = {"displacement": "m", "stress": "Pa"}
 HORIZONS = {"rollout_all": "Full rollout", "rollout_50": "First 50 steps of the rollout", "one_step": "One step"}

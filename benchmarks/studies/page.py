@@ -194,11 +194,8 @@ def verdict(models: dict[str, Any]) -> list[str]:
     if "MGN" in models:
         times = [_mean(models[name]["runs"], COST["ms a frame pair"]) for name in (ours, "MGN")]
         text += f"; its training takes {number(times[0] / times[1])} of MGN's time per frame pair"
-    ahead = [
-        f"{name} ({number(error / errors[best])})"
-        for name, error in errors.items()
-        if error is not None and error < errors[ours]
-    ]
+    smaller = {name: error for name, error in errors.items() if error is not None and error < errors[ours]}
+    ahead = [f"{name} ({number(error / errors[best])})" for name, error in smaller.items()]
     text += f". Better: {'; '.join(ahead)}." if ahead else ". No other row has a smaller error."
     return [text, ""]
 

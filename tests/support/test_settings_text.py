@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from ast_sim.support.errors import ConfigError
 from ast_sim.support.toml_settings import (
     FROM_DATA,
-    Setting,
+    SettingHelp,
     assigned,
     change,
     from_values,
@@ -184,10 +184,10 @@ def test_wrong_toml_names_the_key_and_what_would_fit(text, message):
 def test_settings_are_listed_with_their_help():
     listed = {setting.key: setting for setting in settings(Run)}
     assert list(listed)[:2] == ["model.hidden", "model.inputs"] and len(listed) == 9
-    assert listed["model.hidden"] == Setting("model.hidden", "an integer", "128", "channels")
+    assert listed["model.hidden"] == SettingHelp("model.hidden", "an integer", "128", "channels")
     assert listed["data"].default is None
     assert listed["model.center"].default == "0.0,0.0,0.0"
-    assert listed["tag"] == Setting("tag", 'a text or "none"', "none", "")
+    assert listed["tag"] == SettingHelp("tag", 'a text or "none"', "none", "")
 
 
 @dataclass(frozen=True)

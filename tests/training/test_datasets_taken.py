@@ -39,5 +39,7 @@ def test_an_open_dataset_in_another_unit_is_refused(tmp_path):
 
 def test_the_state_is_a_list_of_names(tmp_path):
     """One text would be taken for its letters."""
-    with pytest.raises(ConfigError, match=r"state is 'reaction'; it must be a list of names, such as \['reaction'\]"):
+    with pytest.raises(
+        ConfigError, match=r"state is 'reaction'; it must be a list of names of fields, such as \['reaction'\]"
+    ):
         train(toy.write(tmp_path / "toy.h5"), tmp_path / "run", steps=2, state="reaction")

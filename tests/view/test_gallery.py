@@ -47,7 +47,7 @@ def shown(path):
 
 def sample(name="train/000000", **changes):
     figures = {"nodes": 10, "elements": 20, "frames": 5, "bodies": 2, "displacement": 0.1, "stress": None, "peak": 4}
-    return survey.Sample(name, **{**figures, "outside": False, "attributes": {}, "seconds": None, **changes})
+    return survey.SampleFigures(name, **{**figures, "outside": False, "attributes": {}, "seconds": None, **changes})
 
 
 def fails(capsys, *arguments):

@@ -35,7 +35,7 @@ def test_encoded_motion_is_the_surface_to_one_in_65534():
     truth, prediction = plate(5), plate(5, seed=1)
     encoded = encode.encode_scene(truth, np.arange(5), [prediction])
     for name in ("body", "obstacle"):
-        triangles, nodes, _ = encode.Surface(truth.scene).groups[name]
+        triangles, nodes, _ = encode.Boundary(truth.scene).groups[name]
         group = encoded["groups"][name]
         stored = np.frombuffer(base64.b64decode(group["triangles"]), "<u4").reshape(-1, 3)
         rest = np.frombuffer(base64.b64decode(group["rest"]), "<f4").reshape(-1, 3)
@@ -45,7 +45,7 @@ def test_encoded_motion_is_the_surface_to_one_in_65534():
             moved = (trajectory.position - truth.scene.rest_position)[:, nodes]
             found = unpack(motion[name]).reshape(moved.shape)
             np.testing.assert_allclose(found, moved, rtol=0, atol=np.abs(moved).max() / 65000)
-    nodes = encode.Surface(truth.scene).groups["body"][1]
+    nodes = encode.Boundary(truth.scene).groups["body"][1]
     assert (truth.scene.node_type[nodes] != NodeType.OBSTACLE).all()
     np.testing.assert_allclose(
         unpack(encoded["truth"]["stress"]), truth.stress[:, nodes].ravel(), atol=truth.stress.max() / 65000
@@ -62,7 +62,7 @@ def test_every_triangle_knows_its_element():
 
 def test_element_stress_stands_on_the_faces():
     truth = plate(3, stress="element")
-    surface = encode.Surface(truth.scene)
+    surface = encode.Boundary(truth.scene)
     owners = surface.groups["body"][2]
     found = unpack(encode.encode_scene(truth, np.arange(3))["truth"]["stress"]).reshape(3, -1)
     np.testing.assert_allclose(found, truth.stress[:, owners, 0], atol=truth.stress.max() / 65000)
@@ -151,7 +151,7 @@ def test_the_column_of_one_run_is_headed_by_its_model():
 
 
 def test_an_element_that_holds_an_obstacle_node_is_shown_as_rigid():
-    groups = encode.Surface(two_tetrahedra()).groups
+    groups = encode.Boundary(two_tetrahedra()).groups
     for name, element, nodes in (("body", 0, [0, 1, 2, 3]), ("obstacle", 1, [1, 2, 3, 4])):
         assert groups[name][1].tolist() == nodes and groups[name][2].tolist() == [element] * 3
 

@@ -52,7 +52,7 @@ _SECONDS_PER_MEGABYTE = 2
 # Bits of VTK's array of ghosts: copies of the cells of another piece, cells that finer ones replace, hidden cells.
 _GHOST_CELL = 1 | 8 | 32
 
-Answer = tuple[dict[str, Any], list[dict[str, np.ndarray]]]
+ReadFrames = tuple[dict[str, Any], list[dict[str, np.ndarray]]]
 
 
 def is_dyna(path: Path) -> bool:
@@ -163,7 +163,7 @@ class _Worker:
         self.process: subprocess.Popen[bytes] | None = None
         self.owner = 0
 
-    def ask(self, path: Path, step: int, budget: int) -> Answer:
+    def ask(self, path: Path, step: int, budget: int) -> ReadFrames:
         seconds = _SECONDS + _SECONDS_PER_MEGABYTE * (path.stat().st_size >> 20)
         request = {"path": str(path.absolute()), "step": step, "bytes": budget, "seconds": seconds}
         process = self._running(path)

@@ -34,7 +34,7 @@ from ast_sim.models.simulator import Simulator
 from ast_sim.named_field import STRESS, Output, require_fields
 from ast_sim.number_arrays import percent
 from ast_sim.scene import Trajectory
-from ast_sim.support.errors import DatasetError
+from ast_sim.support.errors import ConfigError, DatasetError
 
 ONE_STEP_NODES = 8192  # at most, of frames that are predicted together, unless a single one has more
 MEAN_TRAJECTORIES = 100  # training trajectories, at most, of whose stress `stress_constant` is the mean
@@ -60,7 +60,10 @@ def evaluate(
 
     Raises:
         DatasetError: the split has no frame to predict.
+        ConfigError: `made_from` is given, but the solver is not asked for.
     """
+    if made_from is not None and not solver_scenes:
+        raise ConfigError("made_from is for the solver: give solver_scenes, or leave it out")
     indices = dataset.with_frames(split, model.config.data.given_frames + 1)
     if not indices:
         raise DatasetError(f"{dataset.path}: the split {split} has no frame to predict")

@@ -16,6 +16,7 @@ from ast_sim.figures import Figures
 from ast_sim.inference.answering import answers
 from ast_sim.inference.evaluation.evaluate import table
 from ast_sim.inference.predicting.question import Question
+from ast_sim.support.argument_checks import file_name
 from ast_sim.support.disk import write_json
 from ast_sim.support.errors import ConfigError
 from ast_sim.support.notebook_table import html_table, one_line
@@ -59,7 +60,7 @@ class Evaluation:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write all figures as JSON."""
-        write_json(Path(path), self.figures.to_json())
+        write_json(file_name(path, "path"), self.figures.to_json())
 
     def report(self, path: str | os.PathLike[str], title: str = "Learned simulation: predictions and errors") -> None:
         """Write a page with moving scenes, errors, times and settings."""
@@ -120,7 +121,7 @@ def report_evaluations(path: str | os.PathLike[str], evaluations: list[Evaluatio
         ConfigError: the runs were evaluated on different scenes, which have the same names.
     """
     _require_one_dataset(evaluations)
-    make_folder(Path(path).parent)
+    make_folder(file_name(path, "path").parent)
     report.write(path, [evaluation.shown() for evaluation in evaluations], title)
 
 

@@ -37,7 +37,7 @@ MOST_SCENES = 200  # of the training; a fit takes time with the cube of their nu
 FEWEST_SCENES = 2 * FOLDS
 REST = 1e-3  # what the modes leave of the root of the sum of squares
 MOST_MODES = 10
-Law = Callable[[np.ndarray], np.ndarray]  # values of points [m, f]
+Regression = Callable[[np.ndarray], np.ndarray]  # values of points [m, f]
 
 
 def features(drawn: Sequence[Mapping[str, Any]], known: Sequence[Mapping[str, Any]]) -> np.ndarray:
@@ -53,7 +53,7 @@ def features(drawn: Sequence[Mapping[str, Any]], known: Sequence[Mapping[str, An
     return np.array(columns).reshape(len(columns), len(drawn)).T
 
 
-def gaussian_process(x: np.ndarray, y: np.ndarray) -> Law:
+def gaussian_process(x: np.ndarray, y: np.ndarray) -> Regression:
     """What a Gaussian process makes of the points x [n, f] with values y [n].
 
     The kernel is a squared exponential with a length for each feature, and white noise; maximum likelihood chooses. It
@@ -74,7 +74,7 @@ def gaussian_process(x: np.ndarray, y: np.ndarray) -> Law:
     return lambda points: back(process.predict(points))
 
 
-def modal_process(x: np.ndarray, y: np.ndarray) -> Law:
+def modal_process(x: np.ndarray, y: np.ndarray) -> Regression:
     """The same of values [n, d]: a process for each coefficient of their modes."""
     left, size, modes = np.linalg.svd(y.astype(np.float64), full_matrices=False)
     rest = np.sqrt(np.cumsum(size[::-1] ** 2)[::-1])  # of all modes from one on
@@ -95,7 +95,7 @@ def _fitted(x: np.ndarray, y: np.ndarray) -> Any:
         return process.fit(x, y)
 
 
-class Sample(NamedTuple):
+class DeepestTruth(NamedTuple):
     """The deepest frame of a simulated scene.
 
     Attributes:
@@ -111,7 +111,7 @@ class Sample(NamedTuple):
     sizes: Mapping[str, np.ndarray]
 
     @classmethod
-    def of(cls, model: Simulator, info: DatasetInfo, truth: Trajectory) -> Sample:
+    def of(cls, model: Simulator, info: DatasetInfo, truth: Trajectory) -> DeepestTruth:
         frame = deepest_predicted(model, truth)
         scene = truth.scene
         position = truth.position[frame]
@@ -127,7 +127,7 @@ class Sample(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Process:
+class ProcessFigures:
     """What a Gaussian process gave for the scenes of a split.
 
     Attributes:
@@ -156,7 +156,7 @@ class Process:
 
 def process_beside(
     model: Simulator, dataset: Dataset, split: str, indices: Sequence[int], tell: Callable[[str], None]
-) -> Process:
+) -> ProcessFigures:
     """Let a process learn the training scenes of a dataset and predict scenes of a split at their deepest frames.
 
     Args:
@@ -169,10 +169,12 @@ def process_beside(
         wanted = [_sample(model, dataset, split, index) for index in indices]
         return _learned(known, wanted, tell)
     except (ConfigError, MissingExtra) as error:
-        return Process(missing=str(error))
+        return ProcessFigures(missing=str(error))
 
 
-def _learned(known: Sequence[Sample], wanted: Sequence[Sample], tell: Callable[[str], None]) -> Process:
+def _learned(
+    known: Sequence[DeepestTruth], wanted: Sequence[DeepestTruth], tell: Callable[[str], None]
+) -> ProcessFigures:
     """What a process gives for the samples `wanted`, after it has learned from the `known` ones.
 
     Raises:
@@ -199,10 +201,10 @@ def _learned(known: Sequence[Sample], wanted: Sequence[Sample], tell: Callable[[
         for quantity, values in predicted.items():
             errors[quantity].append(relative_distance(values, sample.sizes[quantity]))
     missing = "" if one_mesh else "each scene has a mesh of its own"
-    return Process(f"{len(known)} training scenes, {x.shape[1]} inputs", errors, seconds, missing)
+    return ProcessFigures(f"{len(known)} training scenes, {x.shape[1]} inputs", errors, seconds, missing)
 
 
-def _complete(model: Simulator, dataset: Dataset) -> Iterator[Sample]:
+def _complete(model: Simulator, dataset: Dataset) -> Iterator[DeepestTruth]:
     """The training scenes that move and were simulated to their end."""
     for index in dataset.with_frames("train", model.config.data.given_frames + 1):
         truth = dataset.load("train", index)
@@ -210,9 +212,9 @@ def _complete(model: Simulator, dataset: Dataset) -> Iterator[Sample]:
             yield _sample(model, dataset, "train", index)
 
 
-def _sample(model: Simulator, dataset: Dataset, split: str, index: int) -> Sample:
+def _sample(model: Simulator, dataset: Dataset, split: str, index: int) -> DeepestTruth:
     fields = [name for name, *_ in model.config.data.fields]
-    return Sample.of(model, dataset.info, dataset.load(split, index, fields))
+    return DeepestTruth.of(model, dataset.info, dataset.load(split, index, fields))
 
 
 def _same_mesh(one: Scene, other: Scene) -> bool:
@@ -221,7 +223,7 @@ def _same_mesh(one: Scene, other: Scene) -> bool:
     return same and np.array_equal(one.rest_position[~one.prescribed], other.rest_position[~other.prescribed])
 
 
-def _points(samples: Sequence[Sample], known: Sequence[Sample]) -> np.ndarray:
+def _points(samples: Sequence[DeepestTruth], known: Sequence[DeepestTruth]) -> np.ndarray:
     """[n, f]: the samples as points, by parameters or principal components of the known ones."""
     if known[0].values:
         return features([one.values for one in samples], [one.values for one in known])

@@ -22,10 +22,11 @@ from ast_sim.inference.effort import Effort, choices, options_of
 from ast_sim.inference.evaluation.deepest_frames import deepest_predicted
 from ast_sim.inference.evaluation.gaussian_process import PROCESS, process_beside
 from ast_sim.inference.predicting.question import Question
-from ast_sim.inference.promises.calibration import require_new_scenes
-from ast_sim.inference.quantities.relative_errors import errors_of, moves
+from ast_sim.inference.promises.calibration import require_new_scenes, require_runs
+from ast_sim.inference.quantities.relative_errors import QUANTITIES, errors_of, moves
 from ast_sim.models.simulator import Simulator
 from ast_sim.simulate.jobs.fastest_solver import FINER, OWN_STOP_TEST, Outcome, solver_outcomes
+from ast_sim.support.argument_checks import file_name, several
 from ast_sim.support.disk import write_json
 from ast_sim.support.errors import ConfigError, SimulationError
 from ast_sim.support.progress import Progress, ShowProgress
@@ -39,7 +40,6 @@ if TYPE_CHECKING:
     from ast_sim.inference.trained_run import Run
 
 SCENES = 20
-QUANTITIES = ("displacement", "reaction", "stress")  # as `errors_of` names them
 MESH_SCENES = 3  # in which the mesh's own error is measured
 
 
@@ -68,7 +68,7 @@ class Trade:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write all figures as JSON."""
-        write_json(Path(path), self.to_json())
+        write_json(file_name(path, "path"), self.to_json())
 
     def report(self, path: str | os.PathLike[str], title: str = "Speed against accuracy") -> None:
         """Write a page: error against seconds, and the tables; a missing folder is made.
@@ -77,7 +77,7 @@ class Trade:
             AstSimError: the suffix is neither .html nor .htm, or the file cannot be written.
             MissingExtra: plotly is not installed.
         """
-        make_folder(Path(path).parent)
+        make_folder(file_name(path, "path").parent)
         trade_page.write(path, list(self.by_quantity.values()), title)
 
 
@@ -116,8 +116,12 @@ def trade(
         DatasetError: the dataset cannot be read.
     """
     (scenes,) = whole(1, scenes=scenes)
-    if solver_seconds is not None and not (isinstance(solver_seconds, Real) and 0 < solver_seconds < math.inf):
+    positive = (
+        isinstance(solver_seconds, Real) and not isinstance(solver_seconds, bool) and 0 < solver_seconds < math.inf
+    )
+    if solver_seconds is not None and not positive:
         raise ConfigError(f"the solver's seconds are {solver_seconds!r}; they must be a number above 0")
+    require_runs(run, *several("beside", beside, "runs"))
     runs = _by_name([run, *beside])
     threads = torch.get_num_threads()
     torch.set_num_threads(1)

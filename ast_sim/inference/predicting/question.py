@@ -19,7 +19,7 @@ from ast_sim.scene import Scene, Trajectory
 from ast_sim.support.errors import ConfigError, RolloutError
 from ast_sim.support.toml_settings import NOTHING
 
-Frames = Iterable[int] | int | slice  # numbers of frames; negative ones count from the end
+WantedFrames = Iterable[int] | int | slice  # numbers of frames; negative ones count from the end
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,11 +48,11 @@ class Question:
     notes: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, truth: Trajectory, name: str, frames: Frames | None = None) -> Question:
+    def of(cls, truth: Trajectory, name: str, frames: WantedFrames | None = None) -> Question:
         """The question whose true answer is a known trajectory, which has all frames of its motion."""
         return cls(name, truth.scene, truth.position, fields_of(truth)).asking(frames)
 
-    def asking(self, frames: Frames | None) -> Question:
+    def asking(self, frames: WantedFrames | None) -> Question:
         """The same question for these frames only; negative numbers count from the end.
 
         Raises:
@@ -148,7 +148,7 @@ def fields_of(trajectory: Trajectory) -> dict[str, np.ndarray]:
     return {**{name: one.values for name, one in trajectory.fields.items()}, **stress}
 
 
-def _whole_numbers(frames: Frames, count: int) -> list[int]:
+def _whole_numbers(frames: WantedFrames, count: int) -> list[int]:
     """The frames, of `count`, as a list; one number is a frame, too."""
     wrong = f"frames must be whole numbers, one such number, or a slice, not {frames!r}"
     if isinstance(frames, slice):

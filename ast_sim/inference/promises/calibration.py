@@ -33,6 +33,7 @@ from ast_sim.number_arrays import percent
 from ast_sim.runs.scope import LEEWAY, spacing_of
 from ast_sim.scene import Scene, Trajectory
 from ast_sim.simulate.jobs.fastest_solver import deepest_frame
+from ast_sim.support.argument_checks import require_type
 from ast_sim.support.errors import ConfigError
 from ast_sim.support.progress import Progress, ShowProgress
 
@@ -200,6 +201,7 @@ def calibrate(
     Raises:
         ConfigError: the split has trained or chosen the run, there are fewer than 19 scenes, or too many fail.
     """
+    require_runs(run)
     with run.open(data) as dataset:
         require_new_scenes(run, dataset, split)
         before, run.calibration = run.calibration, None  # it has no say in which scenes count
@@ -216,6 +218,14 @@ def calibrate(
     if run.path.is_file():
         warnings.warn(f"{run.path} is a file, which is not changed: Run.save writes one with the band", stacklevel=2)
     return result
+
+
+def require_runs(*runs: Any) -> None:
+    """Raise ConfigError unless these are trained runs."""
+    from ast_sim import Run  # by its public name: it imports this module
+
+    for run in runs:
+        require_type("a run", run, Run, "a Run, such as ast_sim.Run(folder)")
 
 
 def require_new_scenes(run: Run, dataset: Dataset, split: str) -> None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from ast_sim.inference.effort import Effort
 from ast_sim.inference.promises.kept_errors import DISPLACEMENT, KEPT, in_words
 from ast_sim.inference.promises.milliseconds import effort_within
+from ast_sim.support.argument_checks import require_type
 from ast_sim.support.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -34,7 +35,9 @@ def chosen_effort(
         return within, [{"effort": within.text, "promise": told} for _ in questions]
     if error is not None:
         return _keeping(run, questions, error if isinstance(error, Mapping) else {DISPLACEMENT: error})
-    return (run.effort if effort is None else effort), [{} for _ in questions]
+    effort = run.effort if effort is None else effort
+    require_type("effort", effort, Effort, "an Effort, such as ast_sim.Effort(newton_steps=1)")
+    return effort, [{} for _ in questions]
 
 
 def _keeping(

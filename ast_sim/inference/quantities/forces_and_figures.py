@@ -17,6 +17,7 @@ from ast_sim.dataset.layout import LENGTH_UNITS
 from ast_sim.mechanics.driven import Driven
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean
 from ast_sim.named_field import REACTION
+from ast_sim.number_arrays import real_numbers
 from ast_sim.support.errors import AstSimError, ConfigError, SimulationError
 from ast_sim.view import sweep_files
 from ast_sim.view.files import make_folder
@@ -85,9 +86,20 @@ def write_forces(path: Path, forces: list[BodyForce]) -> None:
     sweep_files.write_table(path, rows)
 
 
+def write_figures(path: Path, answer: Answer) -> None:
+    """Write `Answer.figures` as a table (.csv), a row for each frame, with places relative to the answer's origin."""
+    origin = answer.source.get("origin")
+    figures = figures_of(answer, origin if isinstance(origin, list) else [0.0, 0.0, 0.0])
+    rows = [{"frame": frame, **row} for frame, row in zip(answer.frames, figures, strict=True)]
+    sweep_files.write_table(path, rows)
+
+
 def figures_of(answer: Answer, origin: Sequence[float]) -> list[dict[str, float]]:
     """See `Answer.figures`."""
     scene, rows = answer.scene, []
+    numbers = real_numbers(answer.name, "origin", origin)
+    if numbers.shape != (3,) or not np.isfinite(numbers).all():
+        raise ConfigError(f"{answer.name}: the origin must be three finite numbers")
     try:
         forces = answer.reaction()
     except ConfigError:  # a figure that this scene has not

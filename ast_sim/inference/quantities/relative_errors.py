@@ -10,12 +10,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ast_sim.scene import Trajectory
+from ast_sim.support.argument_checks import require_type
 from ast_sim.support.errors import ConfigError
 from ast_sim.view.fields import require_same_scene
 
 if TYPE_CHECKING:
     from ast_sim.inference.answer import Answer
 
+QUANTITIES = ("displacement", "reaction", "stress")  # as `errors_of` names them
 SAME = 1e-4  # of the size of a scene: positions that are no farther apart differ by rounding
 
 
@@ -55,6 +57,7 @@ def stress_errors(
 
 def errors_of(answer: Answer, truth: Trajectory) -> dict[str, float]:
     """See `Answer.errors`."""
+    require_type("truth", truth, Trajectory, "a Trajectory")
     if not answer.frames:
         raise ConfigError(f"{answer.name}: the answer has no frame to compare")
     row = len(answer.frames) - 1
@@ -77,6 +80,17 @@ def errors_of(answer: Answer, truth: Trajectory) -> dict[str, float]:
 def _require_same_question(answer: Answer, row: int, truth: Trajectory) -> None:
     """Raise AstSimError unless the last frame of `truth` and a row of the answer have the same scene, unit and
     prescribed positions; ConfigError if nothing is displaced there."""
+    _require_same_frame(answer, row, truth)
+    free = ~truth.scene.prescribed
+    if not (truth.position[-1] - truth.position[0])[free].any():
+        raise ConfigError(
+            f"{answer.name}: in frame {truth.numbers[-1]} of the truth nothing is displaced: there is no share of 0"
+        )
+
+
+def _require_same_frame(answer: Answer, row: int, truth: Trajectory) -> None:
+    """Raise AstSimError unless the last frame of `truth` and a row of the answer have the same scene, unit and
+    prescribed positions."""
     require_same_scene(truth, answer.trajectory)
     number = truth.numbers[-1]
     unit = None if answer.info is None else answer.info.length_unit
@@ -89,9 +103,22 @@ def _require_same_question(answer: Answer, row: int, truth: Trajectory) -> None:
             f"{answer.name}: its prescribed nodes and the ones of the truth are up to {away:.3g} apart in frame"
             f" {number}: compare with a simulation of the same motion"
         )
-    free = ~truth.scene.prescribed
-    if not (there - truth.position[0])[free].any():
-        raise ConfigError(f"{answer.name}: in frame {number} of the truth nothing is displaced: there is no share of 0")
+
+
+def require_same_motion(answer: Answer, truth: Trajectory | None) -> None:
+    """Raise AstSimError unless the last frame of the answer is of the same scene, unit and motion in the truth, if one
+    is known."""
+    if truth is None:
+        return
+    require_type("truth", truth, Trajectory, "a Trajectory")
+    if answer.frames:
+        _require_same_frame(answer, len(answer.frames) - 1, truth.select([answer.frames[-1]]))
+
+
+def require_quantity(quantity: str) -> None:
+    """Raise ConfigError unless an error or a band of this quantity may be known."""
+    if quantity not in QUANTITIES:
+        raise ConfigError(f"a band of {quantity!r} is not known; known are {', '.join(QUANTITIES)}")
 
 
 def relative_distance(ours: np.ndarray, true: np.ndarray) -> float:

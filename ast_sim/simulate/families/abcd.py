@@ -24,7 +24,7 @@ from ast_sim.mechanics.unfinished import Checkpoint
 from ast_sim.scene import AttributeValue, NodeType, Scene, Trajectory
 from ast_sim.simulate.shapes.cad.gmsh_process import MeshingFailed
 from ast_sim.simulate.shapes.mesh_check import BadMesh
-from ast_sim.simulate.shapes.pairing import HALF_EXTENT, Pair, Unsuitable, put_likewise, put_together
+from ast_sim.simulate.shapes.pairing import HALF_EXTENT, PairOfParts, Unsuitable, put_likewise, put_together
 from ast_sim.simulate.shapes.part_source import Mesher, PartSource, part_source
 from ast_sim.simulate.shapes.parts import Part
 from ast_sim.support.errors import SimulationError
@@ -102,7 +102,7 @@ def draw_geometry(rng: np.random.Generator, nodes: int = DEFAULT_NODES, parts: P
 
 
 def _remeshed(
-    mesh: Mesher, nodes: int, drawn: tuple[Part, Part], pair: Pair, squeeze: _Squeeze, share: float
+    mesh: Mesher, nodes: int, drawn: tuple[Part, Part], pair: PairOfParts, squeeze: _Squeeze, share: float
 ) -> SolidCase:
     """The case on a mesh with that share of the nodes. Its clamps end where the clamps of the drawn pair end.
 
@@ -122,7 +122,7 @@ def solve(case: SolidCase, checkpoint: Checkpoint | None = None, patient: bool =
     return quasi_static(case, SETTINGS, checkpoint, patient)
 
 
-def _check_walls(pair: Pair) -> None:
+def _check_walls(pair: PairOfParts) -> None:
     """Raise Unsuitable if a surface comes so close to itself that contact would act at rest."""
     contact = Contact(pair.position, pair.faces, pair.body, CONTACT)
     contact.collision_free_fraction(pair.position, pair.position)
@@ -133,7 +133,7 @@ def _check_walls(pair: Pair) -> None:
         )
 
 
-def _draw_squeeze(rng: np.random.Generator, pair: Pair, parts: tuple[Part, Part], mesher: str) -> _Squeeze:
+def _draw_squeeze(rng: np.random.Generator, pair: PairOfParts, parts: tuple[Part, Part], mesher: str) -> _Squeeze:
     young = np.exp(rng.uniform(*np.log(YOUNG), 2))
     poisson, crush = rng.uniform(*POISSON, 2), rng.uniform(*CRUSH)
     attributes: dict[str, AttributeValue] = {
@@ -148,7 +148,7 @@ def _draw_squeeze(rng: np.random.Generator, pair: Pair, parts: tuple[Part, Part]
     return _Squeeze(young, poisson, crush * pair.height + 2 * CONTACT.dhat, attributes)
 
 
-def _case(pair: Pair, squeeze: _Squeeze) -> SolidCase:
+def _case(pair: PairOfParts, squeeze: _Squeeze) -> SolidCase:
     body = pair.body[pair.elements[:, 0]]
     # The solver uses constants and positions as the file stores them, in float32.
     material = np.stack([squeeze.young, squeeze.poisson], axis=1).astype(np.float32)[body]

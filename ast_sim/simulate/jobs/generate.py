@@ -42,6 +42,7 @@ from ast_sim.simulate.jobs.samples import (
     store_sample,
 )
 from ast_sim.simulate.own_assembly.spec_reader import read_spec
+from ast_sim.support.argument_checks import file_name, require_bool
 from ast_sim.support.disk import output_file, replacing
 from ast_sim.support.errors import ConfigError, SimulationError
 from ast_sim.support.progress import ShowProgress
@@ -114,7 +115,7 @@ def generate(
     counts = checked_counts(train, valid, test, calibration)
     workers = checked_workers(workers, scheduler)
     recipe = checked_recipe(module, family, seed, nodes, frames, solver, parts, patient, keep, spec, order)
-    output_file(out := Path(out))
+    output_file(out := file_name(out, "out"))
     settings = recorded(recipe)
     folder = out.with_name(out.name + ".parts")
     if out.exists() and not _grows(out, settings, counts):
@@ -188,8 +189,7 @@ def checked_workers(workers: int | None, scheduler: str | None) -> int:
     """The number of processes; one per available core if None."""
     if workers is not None and scheduler is not None:
         raise ConfigError("workers run on this machine, but a scheduler has its own workers: give one of them")
-    if workers is not None and workers < 1:
-        raise ConfigError(f"workers is {workers}; must be at least 1")
+    (workers,) = whole(1, workers=workers)
     if workers is not None:
         return workers
     if hasattr(os, "sched_getaffinity"):  # not on macOS
@@ -221,6 +221,7 @@ def checked_counts(train: int, valid: int | None, test: int | None, calibration:
 def _check_start(out: Path, made: Path, scenes: int, recipe: Recipe, module: ModuleType) -> None:
     """Refuse broken parts, and what cannot fit on the disk: positions and stress take four float32 a node and frame.
     Where the folder `made` is there, this was checked before."""
+    require_bool(patient=recipe.patient)
     if made.exists():
         return
     check_parts(recipe)

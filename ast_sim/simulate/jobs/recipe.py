@@ -20,6 +20,7 @@ from ast_sim.simulate.jobs.samples import Recipe
 from ast_sim.simulate.own_assembly.spec_reader import read_spec
 from ast_sim.simulate.own_assembly.standing import friction_is_drawn
 from ast_sim.simulate.own_assembly.yielding import material_columns
+from ast_sim.support.argument_checks import file_name
 from ast_sim.support.errors import ConfigError
 from ast_sim.support.toml_settings import whole
 
@@ -70,7 +71,7 @@ def checked_recipe(
     order = None if order == 1 else order
     fewest = module.MINIMUM_NODES if order is None else module.SECOND_ORDER_NODES
     for name, value, minimum in (("seed", seed, 0), ("nodes", nodes, fewest)):
-        if value is not None and value < minimum:
+        if value is None or value < minimum:
             raise ConfigError(f"{name} is {value}; must be at least {minimum}")
     if seed > LARGEST_SEED:
         raise ConfigError(f"seed is {seed}; must be at most 2^63 - 1, the largest number that the file can hold")
@@ -89,8 +90,8 @@ def checked_recipe(
         _source(parts)
     if keep is not None:
         keep = _checked_keep(keep, (frames or module.FRAMES) - 1)
-    parts = None if parts is None else str(Path(parts).resolve())
-    spec = None if spec is None else str(Path(spec).resolve())
+    parts = None if parts is None else str(file_name(parts, "parts").resolve())
+    spec = None if spec is None else str(file_name(spec, "spec").resolve())
     return Recipe(family, seed, nodes, frames, solver, parts, spec, patient, keep, order)
 
 
@@ -117,7 +118,7 @@ def recipe_of(name: str, info: DatasetInfo, made_from: str | os.PathLike[str] | 
         raise ConfigError(f"{name} was made without parts of your own or a specification: leave {made_from} out")
     if key is not None and made_from is None:
         raise ConfigError(f"{name} was made of {own[key]}: say where to find that (--made-from)")
-    parts, spec = (None if made_from is None or key != which else Path(made_from) for which in own)
+    parts, spec = (None if made_from is None or key != which else file_name(made_from, "made_from") for which in own)
     try:
         numbers = whole(seed=made["seed"], nodes=made.get("nodes"), frames=made.get("frames"))
     except (KeyError, ConfigError) as error:

@@ -32,7 +32,7 @@ from ast_sim.simulate.jobs.samples import Recipe, checkpoint_path, make_sample, 
 
 SECONDS_BETWEEN_REPORTS = 1.0
 
-Answer = Callable[[dict[str, Any]], None]
+Reply = Callable[[dict[str, Any]], None]
 
 
 def main() -> None:
@@ -57,7 +57,7 @@ def main() -> None:
             answer({"error": text, "fatal": fatal, "traceback": traceback.format_exc()})
 
 
-def answers_for(parent: int) -> Answer:
+def answers_for(parent: int) -> Reply:
     """A function that answers the parent process with a line of JSON. This process ends when the parent has ended."""
     _end_with(parent)
     # Answers go to the real standard output, which nothing else may write to.
@@ -73,7 +73,7 @@ def answers_for(parent: int) -> Answer:
     return answer
 
 
-def _reporter(answer: Answer) -> Callable[[int, int, int], None]:
+def _reporter(answer: Reply) -> Callable[[int, int, int], None]:
     """The function that a solve calls with (frames done, frames in all, Newton iterations so far), at any rate."""
     last = time.monotonic()
 

@@ -11,7 +11,7 @@ from ast_sim.importers.places import Place
 from ast_sim.prescribed_motion import RigidMotion
 from ast_sim.simulate.own_assembly.expressions import Expression
 from ast_sim.simulate.own_assembly.parameters import Parameter, Values
-from ast_sim.simulate.own_assembly.spec_table import Vector
+from ast_sim.simulate.own_assembly.spec_table import VectorExpression
 from ast_sim.support.errors import ConfigError
 
 STEP_ENDINGS = (".step", ".stp")
@@ -35,10 +35,10 @@ class Move:
 
     key: str
     places: tuple[Place, ...]
-    path: tuple[Vector, ...]
+    path: tuple[VectorExpression, ...]
     rotation: Expression
-    axis: Vector
-    point: Vector
+    axis: VectorExpression
+    point: VectorExpression
 
     def motion(self, values: Values) -> RigidMotion:
         """The motion for these values.
@@ -47,7 +47,7 @@ class Move:
             ConfigError: a number cannot be computed, or the axis is zero.
         """
 
-        def vector(of: Vector) -> tuple[float, float, float]:
+        def vector(of: VectorExpression) -> tuple[float, float, float]:
             x, y, z = (one(values) for one in of)
             return x, y, z
 
@@ -62,8 +62,8 @@ class Move:
 class Finer:
     """A box in which elements are smaller: its lower and its upper corner, and the size."""
 
-    low: Vector
-    high: Vector
+    low: VectorExpression
+    high: VectorExpression
     size: Expression
 
 

@@ -8,11 +8,11 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ast_sim.support.argument_checks import file_name
 from ast_sim.support.disk import read_text
 from ast_sim.support.errors import ConfigError
 
@@ -90,7 +90,7 @@ def read_table(path: str | os.PathLike[str]) -> list[dict[str, Any]]:
         ConfigError: it cannot be read, has no rows, two columns have one name, or a row has another number of values.
     """
     try:
-        lines = [line for line in csv.reader(io.StringIO(read_text(Path(path), "utf-8-sig"))) if line]
+        lines = [line for line in csv.reader(io.StringIO(read_text(file_name(path, "table"), "utf-8-sig"))) if line]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise ConfigError(f"{path}: the table cannot be read: {reason}") from error

@@ -26,7 +26,7 @@ from ast_sim.simulate.own_assembly.assembly_spec import (
 )
 from ast_sim.simulate.own_assembly.parameters import Values
 from ast_sim.simulate.shapes.cad.gmsh_process import gmsh_version, mesh_own_scale
-from ast_sim.simulate.shapes.cad.surface_mend import Surface, stl_surface, whole_surface
+from ast_sim.simulate.shapes.cad.surface_mend import TriangleSurface, stl_surface, whole_surface
 from ast_sim.simulate.shapes.mesh import second_order, straightened
 from ast_sim.simulate.shapes.mesh_check import BadMesh, check_mesh, check_no_intersections, check_surface
 from ast_sim.simulate.shapes.parts import oriented, volumes
@@ -159,7 +159,7 @@ def _request(spec: AssemblySpec, part: PartSpec, values: Values, factor: float, 
     return request | {"geo": str(path)}
 
 
-def _stl(request: dict[str, Any]) -> Surface:
+def _stl(request: dict[str, Any]) -> TriangleSurface:
     """The surface of an STL file, or of the one of its solids that is asked for.
 
     Raises:
@@ -235,7 +235,7 @@ def _raised(mesh: PartMesh) -> PartMesh:
     )
 
 
-def _surface_mesh(part: PartSpec, request: dict[str, Any], surface: Surface) -> PartMesh:
+def _surface_mesh(part: PartSpec, request: dict[str, Any], surface: TriangleSurface) -> PartMesh:
     notes = tuple(f"{request['name']}: {note}" for note in surface.notes)
     mesh = PartMesh(request["name"], request["scale"] * surface.position, surface.triangles, notes=notes)
     return _checked(mesh, part.rigid)

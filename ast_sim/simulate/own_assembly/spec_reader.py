@@ -23,7 +23,8 @@ from ast_sim.simulate.own_assembly.assembly_spec import (
 )
 from ast_sim.simulate.own_assembly.expressions import FUNCTIONS, Expression
 from ast_sim.simulate.own_assembly.parameters import Parameter, parameter, plain
-from ast_sim.simulate.own_assembly.spec_table import Table, Vector
+from ast_sim.simulate.own_assembly.spec_table import Table, VectorExpression
+from ast_sim.support.argument_checks import file_name
 from ast_sim.support.disk import read_text
 from ast_sim.support.errors import ConfigError, nearest_name
 
@@ -59,7 +60,7 @@ def read_spec(path: str | os.PathLike[str]) -> AssemblySpec:
         ConfigError: the file is missing or no TOML, a key is unknown or missing, a value does not fit, or a file is
             missing that it names.
     """
-    path = Path(path)
+    path = file_name(path, "spec")
     try:
         spec = parse_spec(path, read_text(path))
     except (OSError, UnicodeError) as error:
@@ -232,7 +233,7 @@ def _move(table: Table, rigid: bool) -> Move:
     return _rigid_motion(table, where, path)
 
 
-def _rigid_motion(table: Table, places: tuple[Place, ...], path: tuple[Vector, ...] | None) -> Move:
+def _rigid_motion(table: Table, places: tuple[Place, ...], path: tuple[VectorExpression, ...] | None) -> Move:
     axis, point = table.vector("axis", [0, 0, 1]), table.vector("point", [0, 0, 0])
     rotation = table.number("rotation", 0)
     still = Table({"still": [0, 0, 0]}, table.place).path("still")

@@ -8,7 +8,7 @@ from typing import Any
 from ast_sim.simulate.own_assembly.expressions import Expression, expression
 from ast_sim.support.errors import ConfigError, nearest_name
 
-Vector = tuple[Expression, Expression, Expression]
+VectorExpression = tuple[Expression, Expression, Expression]
 
 
 class Table:
@@ -56,12 +56,12 @@ class Table:
         value = self.take(name, default)
         return None if value is None else expression(self.key(name), value, self.known)
 
-    def vector(self, name: str, default: Any = None) -> Vector | None:
+    def vector(self, name: str, default: Any = None) -> VectorExpression | None:
         """Three numbers or expressions."""
         value = self.take(name, default)
         return None if value is None else self._vector(name, value)
 
-    def path(self, name: str) -> tuple[Vector, ...] | None:
+    def path(self, name: str) -> tuple[VectorExpression, ...] | None:
         """One vector, or a list of them."""
         value = self.take(name)
         if value is None:
@@ -92,7 +92,7 @@ class Table:
         if unknown is not None:
             raise ConfigError(f"there is no key {self.key(unknown)}{nearest_name(unknown, self._read)}")
 
-    def _vector(self, name: str, value: Any) -> Vector:
+    def _vector(self, name: str, value: Any) -> VectorExpression:
         if not isinstance(value, list) or len(value) != 3:
             raise ConfigError(f"{self.key(name)} is {value!r}; must be three numbers, such as [0, 0, '-travel']")
         x, y, z = (expression(f"{self.key(name)}[{i}]", one, self.known) for i, one in enumerate(value))

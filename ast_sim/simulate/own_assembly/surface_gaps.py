@@ -16,7 +16,7 @@ from ast_sim.plausibility import overlaps
 
 CREASE = np.radians(50)  # facets that meet at a larger angle do not belong to a curved surface
 
-Pair = tuple[int, int]
+BodyPair = tuple[int, int]
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,13 +107,13 @@ class Near:
         """The place where these two groups of nodes are near to each other."""
         return cls(tuple(group), tuple(other), *surfaces.opposed(group, other), gap)
 
-    def pair(self, surfaces: Surfaces) -> Pair:
+    def pair(self, surfaces: Surfaces) -> BodyPair:
         """The two parts."""
         first, second = sorted((int(surfaces.body[self.group[0]]), int(surfaces.body[self.other[0]])))
         return first, second
 
 
-def places_nearer(surfaces: Surfaces, distance: float, limit: float, pairs: Collection[Pair]) -> list[Near]:
+def places_nearer(surfaces: Surfaces, distance: float, limit: float, pairs: Collection[BodyPair]) -> list[Near]:
     """The places of these pairs of parts that are nearer than the limit, or where parts lie in each other; none if no
     place is nearer than the distance."""
     ipctk = load_ipctk()
@@ -146,7 +146,7 @@ def places_nearer(surfaces: Surfaces, distance: float, limit: float, pairs: Coll
     return [one for one in near if one.pair(surfaces) in pairs]
 
 
-def nodes_inside(surfaces: Surfaces, pair: Pair) -> Iterator[Near]:
+def nodes_inside(surfaces: Surfaces, pair: BodyPair) -> Iterator[Near]:
     """The nodes of one part that lie inside of the other."""
     if surfaces.rigid[pair[0]] and surfaces.rigid[pair[1]]:
         return

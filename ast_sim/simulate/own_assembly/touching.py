@@ -15,7 +15,7 @@ from itertools import combinations, pairwise
 import numpy as np
 
 from ast_sim.element_topology import MIDDLES
-from ast_sim.simulate.own_assembly.surface_gaps import Near, Pair, Surfaces, nodes_inside, places_nearer
+from ast_sim.simulate.own_assembly.surface_gaps import BodyPair, Near, Surfaces, nodes_inside, places_nearer
 from ast_sim.simulate.shapes.mesh_check import boundary
 from ast_sim.simulate.shapes.parts import quarters, smallest_dihedral
 
@@ -44,7 +44,7 @@ def set_back(
     faces = np.concatenate([boundary(cells) + first for (_, cells), first in zip(bodies, offset, strict=False)])
     surfaces = Surfaces(start, faces, np.repeat(np.arange(len(bodies)), np.diff(offset)), rigid)
     depth = _overlaps(surfaces, distance)
-    moved = dict[Pair, set[int]]()
+    moved = dict[BodyPair, set[int]]()
     for _ in range(ROUNDS):
         near = places_nearer(surfaces, distance, MARGIN * distance, depth)
         if not near:
@@ -87,9 +87,9 @@ def _turned(cells: np.ndarray, before: np.ndarray, after: np.ndarray) -> bool:
     return bool(angle.any() or (quarters(after, changed) <= 0).any())
 
 
-def _overlaps(surfaces: Surfaces, distance: float) -> dict[Pair, float]:
+def _overlaps(surfaces: Surfaces, distance: float) -> dict[BodyPair, float]:
     """How deep each two parts lie in each other, without pairs that overlap more than facets do."""
-    depths: dict[Pair, float] = {}
+    depths: dict[BodyPair, float] = {}
     for pair in combinations(range(len(surfaces.rigid)), 2):
         inside = list(nodes_inside(surfaces, pair))
         allowed = [ARCS * surfaces.arcs[[one.triangle, one.opposite]].sum() + distance for one in inside]

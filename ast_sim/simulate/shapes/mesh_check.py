@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from ast_sim.element_topology import FACE_TRIANGLES, LOCAL_FACES
 from ast_sim.mechanics.contact_and_friction import load_ipctk
 from ast_sim.number_arrays import point
-from ast_sim.simulate.shapes.cad.surface_mend import Surface, solids_of
+from ast_sim.simulate.shapes.cad.surface_mend import TriangleSurface, solids_of
 from ast_sim.simulate.shapes.parts import smallest_dihedral, volumes
 from ast_sim.support.errors import SimulationError
 
@@ -91,7 +91,7 @@ def check_surface(position: np.ndarray, triangles: np.ndarray, name: str) -> Non
             a, b = position[edges[np.argmax(wrong)]]
             text = what.format(_count(wrong, "edge", "edges"))
             raise BadMesh(f"{name}: {text}, the first from {point(a)} to {point(b)}")
-    solids = solids_of(Surface(position, triangles))
+    solids = solids_of(TriangleSurface(position, triangles))
     _check_pieces(solids, position[triangles].mean(axis=1), name, "closed by itself")
     a, b, c = np.moveaxis(position[triangles] - position[triangles[0, 0]], 1, 0)
     _check_volume(abs(np.einsum("ij,ij->", a, np.cross(b, c))) / 6, _diagonal(position), name)

@@ -31,7 +31,7 @@ class Unsuitable(SimulationError):
 
 
 @dataclass(frozen=True, eq=False)
-class Pair:
+class PairOfParts:
     """Two parts as they stand: the upper one above the lower, both within [-1,1].
 
     Attributes:
@@ -55,7 +55,7 @@ class Pair:
     scale: float
 
 
-def put_together(rng: np.random.Generator, lower: Part, upper: Part, gap: float) -> Pair:
+def put_together(rng: np.random.Generator, lower: Part, upper: Part, gap: float) -> PairOfParts:
     """Turn both parts, put one above the other and clamp their far ends.
 
     Args:
@@ -83,10 +83,12 @@ def put_together(rng: np.random.Generator, lower: Part, upper: Part, gap: float)
     if min(clamped[:count].sum(), clamped[count:].sum()) < 3:
         raise Unsuitable("an end of a part has no three nodes to clamp")
     height = float(np.ptp(position[clamped, 2])) - gap
-    return Pair(position, elements, faces, body, clamped, height, overlap, float(scale))
+    return PairOfParts(position, elements, faces, body, clamped, height, overlap, float(scale))
 
 
-def put_likewise(pair: Pair, drawn: tuple[Part, Part], parts: tuple[Part, Part], gap: float) -> tuple[Pair, float]:
+def put_likewise(
+    pair: PairOfParts, drawn: tuple[Part, Part], parts: tuple[Part, Part], gap: float
+) -> tuple[PairOfParts, float]:
     """Put other meshes of the same two parts where these parts stand.
 
     Args:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from numbers import Integral
 from typing import Any
 
 import numpy as np
 
+from ast_sim.number_arrays import real_numbers
 from ast_sim.scene import Scene
 from ast_sim.simulate.shapes import mesh
+from ast_sim.support.argument_checks import several
 from ast_sim.support.errors import ConfigError
 
 
@@ -23,6 +26,7 @@ def box(low: Sequence[float], high: Sequence[float], cells: Sequence[int], **arr
     Raises:
         ConfigError: a size or a number of cells is not above 0.
     """
+    low, high = _vector("the box", "low", low), _vector("the box", "high", high)
     size = np.subtract(high, low)
     _require_above_zero("the box", size, cells)
     coordinates, elements = mesh.hexahedral_grid(tuple(cells))
@@ -41,8 +45,12 @@ def plate(size: Sequence[float], cells: Sequence[int], holes: Sequence[Sequence[
     Raises:
         ConfigError: a size or a number of cells is not above 0.
     """
+    size = _vector("the plate", "size", size)
     _require_above_zero("the plate", size, cells)
-    return Scene.of(*mesh.plate(tuple(size), tuple(cells), np.reshape(np.asarray(holes, float), (-1, 3))), **arrays)
+    cut = real_numbers("the plate", "holes", holes).astype(np.float64)
+    if cut.size and (cut.ndim != 2 or cut.shape[1] != 3 or not (cut[:, 2] > 0).all() or not np.isfinite(cut).all()):
+        raise ConfigError("the holes of the plate must be triples: centre x, centre y and a radius above 0")
+    return Scene.of(*mesh.plate(tuple(size), tuple(cells), cut.reshape(-1, 3)), **arrays)
 
 
 def ball(center: Sequence[float], radius: float, cells: int, **arrays: Any) -> Scene:
@@ -58,8 +66,9 @@ def ball(center: Sequence[float], radius: float, cells: int, **arrays: Any) -> S
         ConfigError: the radius is not above 0, or the number of cells is not even.
     """
     _require_above_zero("the ball", [radius], [cells], even=True)
+    center = _vector("the ball", "center", center)
     position, elements = mesh.ball(radius, cells)
-    return Scene.of(position + np.asarray(center), elements, **arrays)
+    return Scene.of(position + center, elements, **arrays)
 
 
 def cylinder(
@@ -78,16 +87,29 @@ def cylinder(
         ConfigError: a size is not above 0, the number of cells is not even, or there is no such axis.
     """
     _require_above_zero("the cylinder", [radius, length], [cells], even=True)
+    center = _vector("the cylinder", "center", center)
     if axis not in ("x", "y", "z"):
         raise ConfigError(f"the axis of the cylinder is {axis!r}; must be x, y or z")
     position, elements = mesh.cylinder(radius, length / 2, cells)
-    return Scene.of(np.roll(position, "xyz".index(axis), axis=1) + np.asarray(center), elements, **arrays)
+    return Scene.of(np.roll(position, "xyz".index(axis), axis=1) + center, elements, **arrays)
+
+
+def _vector(what: str, name: str, value: Sequence[float]) -> np.ndarray:
+    """[3] float64, of three finite numbers."""
+    numbers = real_numbers(what, name, value)
+    if numbers.shape != (3,) or not np.isfinite(numbers).all():
+        raise ConfigError(f"{name} of {what} must be three finite numbers")
+    return np.asarray(value, np.float64)
 
 
 def _require_above_zero(
     what: str, sizes: Sequence[float] | np.ndarray, cells: Sequence[int], even: bool = False
 ) -> None:
-    if not (np.asarray(sizes) > 0).all():
-        raise ConfigError(f"{what} has the size {np.asarray(sizes).tolist()}; every size must be above 0")
-    if not all(int(count) == count and count > 0 and not (even and count % 2) for count in cells):
-        raise ConfigError(f"{what} has {list(cells)} cells; must be {'even ' if even else ''}whole numbers above 0")
+    if not (real_numbers(what, "its sizes", sizes) > 0).all() or not np.isfinite(sizes).all():
+        shown = ", ".join(f"{size:g}" for size in sizes)
+        raise ConfigError(f"{what} has the size [{shown}]; every size must be above 0")
+    counts = several("cells", cells, "three numbers of cells")
+    whole = all(isinstance(count, Integral) and not isinstance(count, bool) and count > 0 for count in counts)
+    if not whole or len(counts) != (1 if even else 3) or (even and counts[0] % 2):
+        needs = "an even whole number" if even else "three whole numbers"
+        raise ConfigError(f"{what} has {counts} cells; must be {needs} above 0")

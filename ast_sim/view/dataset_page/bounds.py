@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from ast_sim.view.dataset_page.survey import Sample
+from ast_sim.view.dataset_page.survey import SampleFigures
 
 # Largest relative imbalance of work in a typical frame. Of 2,160 scenes of plates and parts, the worst has 0.0014; half
 # of them are below 1e-5.
@@ -29,7 +29,7 @@ class Bound:
 
     title: str
     what: str
-    figure: Callable[[Sample], float | None]
+    figure: Callable[[SampleFigures], float | None]
     worst: Callable[[Sequence[float]], float]
     holds: Callable[[float], bool]
     text: str
@@ -79,7 +79,7 @@ def bounds(length_unit: str) -> list[Bound]:
     ]
 
 
-def verdicts(samples: Sequence[Sample], length_unit: str) -> list[dict[str, Any]]:
+def verdicts(samples: Sequence[SampleFigures], length_unit: str) -> list[dict[str, Any]]:
     """One row for each bound: range over the samples, worst sample, number of samples that record it, and verdict.
 
     `passed` is None if no sample records the figure. The last row says whether all nodes stay inside the domain.
@@ -102,7 +102,7 @@ def verdicts(samples: Sequence[Sample], length_unit: str) -> list[dict[str, Any]
     return rows
 
 
-def _verdict(samples: Sequence[Sample], bound: Bound) -> dict[str, Any]:
+def _verdict(samples: Sequence[SampleFigures], bound: Bound) -> dict[str, Any]:
     figures = {s.name: value for s in samples if (value := bound.figure(s)) is not None}
     failed = [name for name, value in figures.items() if not bound.holds(value)]
     # NaN is worse than any other figure. An infinite gap means that there is nothing to touch: it is not shown.

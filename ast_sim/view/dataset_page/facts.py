@@ -8,7 +8,7 @@ from typing import Any
 from ast_sim.dataset.layout import FORMAT, VERSION
 from ast_sim.dataset.reader import Dataset
 from ast_sim.dataset.solver_seconds import SolverSeconds
-from ast_sim.view.dataset_page.survey import Sample
+from ast_sim.view.dataset_page.survey import SampleFigures
 
 # Records of the samples that are settings, not results: attribute -> (name, unit). The unit "" means none, and "length"
 # means the dataset's unit of length.
@@ -23,7 +23,7 @@ SETTINGS = {
 KNOWN = ("program", "versions", "family", "command", "seed", "licence")
 
 
-def dataset_facts(dataset: Dataset, samples: Sequence[Sample], seconds: SolverSeconds) -> list[list[str]]:
+def dataset_facts(dataset: Dataset, samples: Sequence[SampleFigures], seconds: SolverSeconds) -> list[list[str]]:
     """Rows of name and text: file, generator, settings and sizes. "not recorded" stands where the file is silent."""
     info, generator = dataset.info, dataset.info.generator
     unit = info.length_unit
@@ -66,7 +66,7 @@ def _text(value: Any) -> str:
     return "" if value is None else str(value)
 
 
-def _spread(samples: Sequence[Sample], key: str, unit: str) -> str:
+def _spread(samples: Sequence[SampleFigures], key: str, unit: str) -> str:
     """The one value of all samples, or the range of their values."""
     words = sorted({str(s.attributes[key]) for s in samples if isinstance(s.attributes.get(key), str)})
     if words:
@@ -79,7 +79,7 @@ def _spread(samples: Sequence[Sample], key: str, unit: str) -> str:
     return f"{low:,.9g}{'' if low == high else f' to {high:,.9g}'} {unit}".strip()
 
 
-def _sizes(samples: Sequence[Sample]) -> str:
+def _sizes(samples: Sequence[SampleFigures]) -> str:
     def span(name: str) -> str:
         values = [getattr(sample, name) for sample in samples]
         low = min(values)

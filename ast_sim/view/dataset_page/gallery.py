@@ -21,11 +21,9 @@ from ast_sim.view.dataset_page import survey
 from ast_sim.view.dataset_page.bounds import verdicts
 from ast_sim.view.dataset_page.facts import dataset_facts
 from ast_sim.view.dataset_page.histogram import histogram
-from ast_sim.view.dataset_page.survey import Sample
-from ast_sim.view.encode import Surface, encode_scene, finite_json
+from ast_sim.view.dataset_page.survey import SampleFigures
+from ast_sim.view.encode import Boundary, Json, encode_scene, finite_json
 from ast_sim.view.files import make_folder
-
-Json = dict[str, Any]
 
 PANELS = 12  # at most this many
 SCENE_BYTES = (
@@ -59,7 +57,7 @@ def write(path: str | os.PathLike[str], data: str | os.PathLike[str], progress: 
     page.write(path, content, f"{dataset.info.family}: {data.name}")
 
 
-def page_data(dataset: Dataset, samples: Sequence[Sample], seconds: SolverSeconds) -> Json:
+def page_data(dataset: Dataset, samples: Sequence[SampleFigures], seconds: SolverSeconds) -> Json:
     """Everything that the page's scripts show, as JSON. `samples` and `seconds` belong to the dataset."""
     unit = dataset.info.length_unit
     ranked = sorted(samples, key=lambda sample: (sample.displacement, sample.name))
@@ -104,12 +102,12 @@ class _Cost:
     frames: int
 
 
-def _cost(dataset: Dataset, sample: Sample) -> _Cost:
+def _cost(dataset: Dataset, sample: SampleFigures) -> _Cost:
     """Bytes in base64. The surface has three int32 a triangle and three float32 a node.
 
     A frame has three int16 a node, and one for each stress.
     """
-    groups = Surface(dataset.scene(sample.split, sample.index)).groups
+    groups = Boundary(dataset.scene(sample.split, sample.index)).groups
     nodes = sum(len(nodes) for _, nodes, _ in groups.values())
     triangles = sum(len(triangles) for triangles, _, _ in groups.values())
     body, body_nodes, _ = groups["body"]
@@ -138,7 +136,7 @@ def choose_panels(cost: Callable[[int], _Cost], count: int) -> tuple[list[int], 
     return chosen, max(fitting, default=2)
 
 
-def _scenes(dataset: Dataset, ranked: Sequence[Sample]) -> tuple[list[Json], str]:
+def _scenes(dataset: Dataset, ranked: Sequence[SampleFigures]) -> tuple[list[Json], str]:
     """The scenes of the panels, and a note: by which rule they were chosen and what they leave out."""
     if not ranked:
         return [], ""
@@ -161,7 +159,7 @@ def _scenes(dataset: Dataset, ranked: Sequence[Sample]) -> tuple[list[Json], str
     return scenes, _scenes_note(scenes, len(ranked))
 
 
-def _scene_note(sample: Sample) -> str:
+def _scene_note(sample: SampleFigures) -> str:
     end = "" if sample.complete else f", stopped after frame {sample.frames - 1}"
     return f"{sample.nodes:,} nodes{end}"
 
@@ -185,10 +183,10 @@ def _scenes_note(scenes: Sequence[Json], count: int) -> str:
     return f"{rule} The panels show surfaces only{''.join(f', {text}' for text in left_out)}."
 
 
-def histograms(samples: Sequence[Sample], length_unit: str) -> list[Json]:
+def histograms(samples: Sequence[SampleFigures], length_unit: str) -> list[Json]:
     """The charts of the page. A chart without figures says that it has none."""
 
-    def chart(title: str, unit: str | None, values: Callable[[Sample], Sequence[float]], counted: str) -> Json:
+    def chart(title: str, unit: str | None, values: Callable[[SampleFigures], Sequence[float]], counted: str) -> Json:
         by_split: dict[str, list[float]] = {}
         for sample in samples:
             by_split.setdefault(sample.split, []).extend(values(sample))
@@ -216,7 +214,7 @@ def histograms(samples: Sequence[Sample], length_unit: str) -> list[Json]:
     ]
 
 
-def _yields(samples: Sequence[Sample]) -> Json:
+def _yields(samples: Sequence[SampleFigures]) -> Json:
     """How many samples are complete, by split, and why the others stopped."""
     stopped = [sample for sample in samples if not sample.complete]
     reasons = Counter(reason(sample) for sample in stopped)
@@ -237,21 +235,21 @@ def _yields(samples: Sequence[Sample]) -> Json:
     }
 
 
-def reason(sample: Sample) -> str:
+def reason(sample: SampleFigures) -> str:
     """Why a sample stopped, without frame number and figures, so that equal reasons are counted together."""
     text = str(sample.attributes.get("stopped_by", "not recorded"))
     text = re.sub(r"^frame \d+: ", "", text)
     return re.sub(r"[-+]?\d+(\.\d+)?(e[-+]?\d+)?", "…", re.sub(r" \([^()]*\)", "", text))
 
 
-def _lead(dataset: Dataset, samples: Sequence[Sample]) -> str:
+def _lead(dataset: Dataset, samples: Sequence[SampleFigures]) -> str:
     if not samples:
         return f"{dataset.path.name} holds no samples."
     counts = ", ".join(f"{count:,} {split}" for split, count in dataset.splits.items() if count)
     return f"Simulated scenes of {dataset.path.name}: {counts}."
 
 
-def _tiles(samples: Sequence[Sample], checks: Sequence[Json], length_unit: str) -> list[Json]:
+def _tiles(samples: Sequence[SampleFigures], checks: Sequence[Json], length_unit: str) -> list[Json]:
     """The figures that matter most, for the head of the page."""
     if not samples:
         return []
@@ -289,11 +287,11 @@ def _floor_percent(part: int, whole: int) -> str:
     return f"{tenths // 10}" if tenths % 10 == 0 else f"{tenths / 10:.1f}"
 
 
-def _samples_table(ranked: Sequence[Sample], length_unit: str) -> Json:
+def _samples_table(ranked: Sequence[SampleFigures], length_unit: str) -> Json:
     """The figures of the samples, in ascending order of largest displacement. Of many samples, some at even steps."""
     shown = [ranked[index] for index in spread(len(ranked), LISTED)] if ranked else []
 
-    def column(label: str, unit: str | None, value: Callable[[Sample], Any]) -> Json:
+    def column(label: str, unit: str | None, value: Callable[[SampleFigures], Any]) -> Json:
         return {"label": label, "unit": unit, "values": [value(sample) for sample in shown]}
 
     columns = [

@@ -15,7 +15,7 @@ from ast_sim.scene import AttributeValue, Trajectory
 
 
 @dataclass(frozen=True)
-class Sample:
+class SampleFigures:
     """The figures of one sample.
 
     Attributes:
@@ -112,14 +112,14 @@ def names(dataset: Dataset) -> list[str]:
     return [f"{split}/{index:06d}" for split, count in dataset.splits.items() for index in range(count)]
 
 
-def survey(dataset: Dataset, seconds: SolverSeconds) -> Iterator[Sample]:
+def survey(dataset: Dataset, seconds: SolverSeconds) -> Iterator[SampleFigures]:
     """The figures of every sample, in the order of the file. One trajectory is in memory at a time."""
     for name in names(dataset):
         split, _, index = name.partition("/")
         yield figures(name, dataset.load(split, int(index)), dataset.info, seconds.samples.get(name))
 
 
-def figures(name: str, trajectory: Trajectory, info: Any, seconds: list[float] | None) -> Sample:
+def figures(name: str, trajectory: Trajectory, info: Any, seconds: list[float] | None) -> SampleFigures:
     """The figures of a trajectory; `info` describes its dataset."""
     scene, attributes = trajectory.scene, trajectory.attributes
     largest = _largest_displacements(trajectory)
@@ -130,7 +130,7 @@ def figures(name: str, trajectory: Trajectory, info: Any, seconds: list[float] |
     center = np.array(info.domain_center)
     half = info.domain_half_width
     old = attributes.get("solve_seconds")  # files of earlier versions kept the seconds here
-    return Sample(
+    return SampleFigures(
         name=name,
         nodes=scene.num_nodes,
         elements=scene.num_elements,

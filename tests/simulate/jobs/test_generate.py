@@ -336,7 +336,7 @@ def test_two_runs_on_one_file_exclude_each_other(tmp_path):
         ({"nodes": "100"}, "nodes is '100'; it must be a whole number"),
         ({"nodes": 20}, "nodes is 20; must be at least 80"),
         ({"frames": 2}, "frames is 2; must be at least 3"),
-        ({"workers": 0}, "workers is 0; must be at least 1"),
+        ({"workers": 0}, "workers is 0; it must be at least 1"),
         ({"workers": 2, "scheduler": "tcp://localhost:1"}, "give one of them"),
         ({"solver": "abaqus"}, "no solver 'abaqus'; use one of own, calculix"),
         ({"family": "abcd", "solver": "calculix", "patient": True}, "patient is for the own solver"),

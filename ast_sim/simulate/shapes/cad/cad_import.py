@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from ast_sim.number_arrays import point
-from ast_sim.simulate.shapes.cad.surface_mend import Surface, several_solids
+from ast_sim.simulate.shapes.cad.surface_mend import TriangleSurface, several_solids
 
 MENDED = ("Degenerated", "SmallEdges", "SmallFaces")
 VTK_ORDER = [0, 1, 2, 3, 4, 5, 6, 7, 9, 8]  # of the nodes of a second-order tetrahedron, in gmsh's
@@ -120,7 +120,7 @@ def _open_edge(gmsh, scale: float) -> str:
     return f": its shell is open, {len(single)} edges bound only one face, the first at {point(where)}"
 
 
-def solid_of_surface(gmsh, surface: Surface, crease_angle: float = CREASE_ANGLE) -> None:
+def solid_of_surface(gmsh, surface: TriangleSurface, crease_angle: float = CREASE_ANGLE) -> None:
     """Make a solid of a closed surface of triangles, cut along its creases into faces. Of an open one, faces only."""
     mesh = gmsh.model.mesh
     gmsh.model.addDiscreteEntity(2, 1)

@@ -42,7 +42,7 @@ NODE_TOLERANCE = 0.1  # a mesh whose number of nodes is this near to the wanted 
 
 
 @dataclass(frozen=True)
-class Model:
+class PartModel:
     """A part in gmsh.
 
     Attributes:
@@ -101,7 +101,7 @@ def _refuse(text: str) -> int:
     return 3
 
 
-def _load(gmsh, name: str, part: dict[str, Any]) -> Model:
+def _load(gmsh, name: str, part: dict[str, Any]) -> PartModel:
     gmsh.model.add(name)
     if "stl" in part:
         return _load_stl(gmsh, name, part)
@@ -117,7 +117,7 @@ def _load(gmsh, name: str, part: dict[str, Any]) -> Model:
     area = sum(occ.getMass(*surface) for surface in gmsh.model.getEntities(2))
     if not volume > 1e-6:
         raise BadPart(f"its volume is {volume * scale**3:.3g}, as good as zero for its size")
-    return Model(name, part, volume, area, scale)
+    return PartModel(name, part, volume, area, scale)
 
 
 def _to_unit_diagonal(gmsh) -> float:
@@ -163,7 +163,7 @@ def _slab(occ, at: list[float], size: list[float], corner: float) -> int:
     return next(tag for dimension, tag in occ.extrude([(2, face)], 0, 0, size[2]) if dimension == 3)
 
 
-def _load_stl(gmsh, name: str, part: dict[str, Any]) -> Model:
+def _load_stl(gmsh, name: str, part: dict[str, Any]) -> PartModel:
     """A closed surface of triangles, cut along its creases into faces. gmsh meshes these faces again."""
     surface = stl_surface(Path(part["stl"]))
     scale = surface.diagonal
@@ -172,10 +172,10 @@ def _load_stl(gmsh, name: str, part: dict[str, Any]) -> Model:
     normal = np.cross(b - a, c - a)
     volume = float(np.einsum("ij,ij->", a, normal)) / 6
     area = float(np.linalg.norm(normal, axis=1).sum()) / 2
-    return Model(name, part, abs(volume), area, scale, unit=scale)
+    return PartModel(name, part, abs(volume), area, scale, unit=scale)
 
 
-def _mesh_all(gmsh, models: list[Model], nodes: int) -> list[tuple[np.ndarray, np.ndarray]]:
+def _mesh_all(gmsh, models: list[PartModel], nodes: int) -> list[tuple[np.ndarray, np.ndarray]]:
     """Meshes of all parts with one element size, which is sought until they have about `nodes` nodes together."""
     correction, best = 1.0, None
     for _ in range(MESHES):
@@ -190,12 +190,12 @@ def _mesh_all(gmsh, models: list[Model], nodes: int) -> list[tuple[np.ndarray, n
     return best[1]
 
 
-def _expected(models: list[Model], size: float) -> float:
+def _expected(models: list[PartModel], size: float) -> float:
     """About how many nodes meshes of this element size have: 0.72 per size^3 of volume, 1.4 per size^2 of surface."""
     return sum(0.72 * model.volume / size**3 + 1.4 * model.area / size**2 for model in models)
 
 
-def _element_size(models: list[Model], nodes: float) -> float:
+def _element_size(models: list[PartModel], nodes: float) -> float:
     low, high = 1e-4, 2.0
     for _ in range(60):
         middle = math.sqrt(low * high)
@@ -203,7 +203,7 @@ def _element_size(models: list[Model], nodes: float) -> float:
     return low
 
 
-def _mesh(gmsh, model: Model, size: float) -> tuple[np.ndarray, np.ndarray]:
+def _mesh(gmsh, model: PartModel, size: float) -> tuple[np.ndarray, np.ndarray]:
     gmsh.model.setCurrent(model.name)
     if "stl" in model.request:  # clearing its mesh would remove the surface itself
         gmsh.model.remove()

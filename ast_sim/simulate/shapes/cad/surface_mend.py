@@ -22,7 +22,7 @@ NO_HEIGHT = 1e-6  # height of a triangle that has no area, relative to its longe
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
+class TriangleSurface:
     """A surface.
 
     Attributes:
@@ -49,13 +49,13 @@ class Surface:
         """Whether two triangles meet at every edge."""
         return bool((self.edges()[1] == 2).all())
 
-    def only(self, rows: np.ndarray) -> Surface:
+    def only(self, rows: np.ndarray) -> TriangleSurface:
         """Some of its triangles, with their nodes."""
         used, triangles = np.unique(self.triangles[rows], return_inverse=True)
-        return Surface(self.position[used], triangles.reshape(-1, 3), self.notes)
+        return TriangleSurface(self.position[used], triangles.reshape(-1, 3), self.notes)
 
 
-def stl_surface(path: Path, solid: str | int | None = None, whole: bool = False) -> Surface:
+def stl_surface(path: Path, solid: str | int | None = None, whole: bool = False) -> TriangleSurface:
     """The surface of one solid of an STL file, mended.
 
     Args:
@@ -105,18 +105,18 @@ def several_solids(solids: list[tuple[str, np.ndarray, np.ndarray]]) -> str:
     return f"it holds {len(solids)} solids: {'; '.join(shown)}{more}; say which one the part is: solid = 1{named}"
 
 
-def whole_surface(corners: np.ndarray) -> Surface:
+def whole_surface(corners: np.ndarray) -> TriangleSurface:
     """The surface of triangles with these corners [F,3,3], mended."""
     surface = _joined(corners, SAME_PLACE)
     for tolerance in () if surface.is_closed else CRACKS:
         wider = _joined(corners, tolerance)
         if wider.is_closed:
             crack = f"cracks of up to {tolerance * surface.diagonal:.2g} in its surface are closed"
-            return Surface(wider.position, wider.triangles, (*wider.notes, crack))
+            return TriangleSurface(wider.position, wider.triangles, (*wider.notes, crack))
     return surface
 
 
-def _joined(corners: np.ndarray, tolerance: float) -> Surface:
+def _joined(corners: np.ndarray, tolerance: float) -> TriangleSurface:
     """Corners closer than `tolerance` diagonals become one; triangles without an area go."""
     points, triangles = _exactly_joined(corners)
     diagonal = float(np.linalg.norm(np.ptp(points, axis=0)))
@@ -131,7 +131,7 @@ def _joined(corners: np.ndarray, tolerance: float) -> Surface:
     gone, folds = int(points_alone.sum()) + needles, len(whole) - len(kept)
     notes = [f"{gone} triangle{'s' * (gone > 1)} of no area left out"] if gone else []
     notes += [f"{folds} triangles that stand twice left out"] if folds else []
-    return Surface(position, kept, tuple(notes)).only(np.arange(len(kept)))
+    return TriangleSurface(position, kept, tuple(notes)).only(np.arange(len(kept)))
 
 
 def _exactly_joined(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -186,7 +186,7 @@ def _without_folds(triangles: np.ndarray) -> np.ndarray:
     return triangles[np.sort(first[balance != 0])]
 
 
-def pieces_of(surface: Surface) -> np.ndarray:
+def pieces_of(surface: TriangleSurface) -> np.ndarray:
     """[F]: the piece that each triangle belongs to, from 0, in the order of their first triangles. Triangles that share
     an edge belong to one piece."""
     edges = np.sort(surface.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
@@ -201,7 +201,7 @@ def pieces_of(surface: Surface) -> np.ndarray:
     return np.argsort(np.argsort(first))[label]
 
 
-def solids_of(surface: Surface) -> np.ndarray:
+def solids_of(surface: TriangleSurface) -> np.ndarray:
     """[F]: the solid that each triangle of a closed surface bounds, from 0: an outer piece and the cavities in it."""
     piece = pieces_of(surface)
     count = int(piece.max()) + 1

@@ -1,0 +1,52 @@
+"""Checks of what a caller hands over: a wrong kind of argument is one clear line that names the argument."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from ast_sim.support.errors import ConfigError
+
+
+def file_name(value: Any, name: str) -> Path:
+    """The name of a file or a folder as a path.
+
+    Raises:
+        ConfigError: it is neither a text nor a path, or it is empty; the text names the argument `name`.
+    """
+    if not isinstance(value, str | os.PathLike) or not os.fspath(value) or "\0" in str(value):
+        raise ConfigError(f"{name} is {in_short(value)}; it must be the name of a file or a folder")
+    return Path(value)
+
+
+def require_type(name: str, value: Any, types: type | tuple[type, ...], what: str) -> None:
+    """Raise ConfigError unless the argument `name` is an instance of one of the types, which `what` says in words."""
+    if not isinstance(value, types):
+        raise ConfigError(f"{name} is {in_short(value)}; it must be {what}")
+
+
+def several(name: str, values: Any, what: str) -> list[Any]:
+    """What an argument holds as a list; `what` says in words what it may hold.
+
+    Raises:
+        ConfigError: it is one thing, or a text, whose letters would be taken for the things.
+    """
+    if isinstance(values, str | bytes) or not isinstance(values, Iterable):
+        raise ConfigError(f"{name} is {in_short(values)}; it must be a list of {what}")
+    return list(values)
+
+
+def require_bool(**values: Any) -> None:
+    """Raise ConfigError unless the arguments are True or False: any text, such as "no", would count as True."""
+    for name, value in values.items():
+        require_type(name, value, bool, "True or False")
+
+
+def in_short(value: Any) -> str:
+    """A value in a message: itself if it is short, else its type."""
+    if value is None or isinstance(value, str | int | float | complex | bytes):
+        shown = repr(value)
+        return shown if len(shown) <= 60 else f"{shown[:50]}..."
+    return f"the class {value.__name__}" if isinstance(value, type) else f"of the type {type(value).__name__}"
