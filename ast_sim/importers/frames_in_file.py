@@ -24,7 +24,7 @@ from ast_sim.support.errors import DatasetError
 WITH_FRAMES = (".vtkhdf", ".frd", ".xdmf", ".xmf", ".e", ".ex2", ".exo", ".exoii", ".exii")
 
 # Formats in which each frame is a file of its own.
-ONE_FRAME = (".vtu", ".pvtu", ".vtk", ".vtp", ".pvtp", ".vtm")
+ONE_FRAME = (".vtu", ".pvtu", ".vtk", ".vtp", ".pvtp", ".vtm", ".vtmb")
 
 
 def holds_frames(path: Path) -> bool:

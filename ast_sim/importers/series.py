@@ -17,7 +17,7 @@ from ast_sim.importers.frame_order import frame_files, ordered
 from ast_sim.importers.frames_in_file import frames_in
 from ast_sim.importers.mesh_file import MeshFile, mesh_of, raw_field
 from ast_sim.importers.scene_mesh import clamped
-from ast_sim.importers.solids.frames_match import order_of_cells
+from ast_sim.importers.solids.frames_match import in_order_of, order_of_cells
 from ast_sim.importers.solids.kept_fields import KeptFields
 from ast_sim.importers.solids.mesh_elements import require_extent
 from ast_sim.importers.solids.positions import far_origin, rest_and_position, warn_of_rounding, with_layers
@@ -193,8 +193,10 @@ def _read_frames(
             first = frame
             stitching = Stitching(frame)
             place, order, notes = _stress_place(frame, names)
+        frame, said = in_order_of(frame, first)
+        notes += said
         cells = order_of_cells(frame, first)
-        if cells is not None and len(notes) < 2:
+        if cells is not None and not said and len(notes) < 2:
             notes.append(
                 f"the elements of {frame.path.name} stand in another order: they are reordered as in the first"
             )
