@@ -99,6 +99,29 @@ def test_keywords_that_change_the_mesh_are_refused_by_name(tmp_path, keyword):
         read_mesh(path)
 
 
+@pytest.mark.parametrize(
+    ("line", "cause"),
+    [
+        ("*", "a single asterisk; a comment begins with two"),
+        ("* the other half", r"the elements after this line seem to belong to \*ELEMENT in line 20; a comment"),
+        ("*ELEMNT, TYPE=C3D4", r"is this \*ELEMENT\?"),
+        ("*ELEMENTS, TYPE=C3D4", r"is this \*ELEMENT\?"),
+    ],
+)
+def test_elements_behind_a_line_that_is_no_keyword_are_not_lost(tmp_path, line, cause):
+    path = deck(tmp_path)
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([*lines[:30], line, *lines[30:]]) + "\n")
+    with pytest.raises(DatasetError, match=rf"deck.inp:31: \*\w*: {cause}"):
+        read_mesh(path)
+
+
+@pytest.mark.parametrize("keyword", ["BOUNDARY", "SPRING", "MEMBRANE SECTION"])
+def test_keywords_behind_elements_are_no_elements(tmp_path, keyword):
+    path = deck(tmp_path, "*ELEMENT, TYPE=S3", "1001, 1, 2, 3", f"*{keyword}", "5, 1, 3, 0", "*", "** a comment")
+    assert len(read_mesh(path).elements) == TETRAHEDRA
+
+
 @pytest.mark.parametrize("lines", [("*ELEMENT, TYPE=C3D99", "1001, 1, 2"), ("*ELEMENT, TYPE=U1", "1001, 1, 2")])
 def test_unknown_elements_are_refused_by_name(tmp_path, lines):
     with pytest.raises(DatasetError, match=r"elements of the type (C3D99|U1) are not known here"):
