@@ -245,6 +245,8 @@ def _displacement(frame: SourceMesh, names: FieldNames) -> np.ndarray | None:
     value = raw_field(frame, "point", names.displacement or "displacement")
     if value.shape[1] not in (2, 3):
         raise DatasetError(f"{frame.path}: the displacement has {value.shape[1]} components; must have 2 or 3")
+    if value.shape[1] == 2 and any(block.dimension == 3 for block in frame.blocks):
+        raise DatasetError(f"{frame.path}: the displacement of a body with a volume has 2 components; must have 3")
     return np.pad(value, ((0, 0), (0, 3 - value.shape[1])))
 
 
