@@ -92,6 +92,16 @@ def test_an_instance_is_moved_and_then_turned_counter_clockwise(tmp_path):
     np.testing.assert_allclose(points, [[2, 5, 0], [2, 6, 0], [1, 5, 0], [2, 5, 1]], atol=1e-12)
 
 
+@pytest.mark.parametrize("line", ["0, 0, 0, 0, 0, 1", "0, 0, 5"])
+def test_a_rotation_without_an_angle_is_refused(tmp_path, line):
+    path = tmp_path / "deck.inp"
+    nodes = "1, 0, 0, 0\n2, 1, 0, 0\n3, 0, 1, 0\n4, 0, 0, 1\n*ELEMENT, TYPE=C3D4\n1, 1, 2, 3, 4"
+    part = f"*PART, NAME=A\n*NODE\n{nodes}\n*END PART\n"
+    path.write_text(f"{part}*INSTANCE, NAME=C, PART=A\n5, 0, 0\n{line}\n*END INSTANCE\n")
+    with pytest.raises(DatasetError, match=r"deck.inp:12: a rotation has two points of its axis and an angle"):
+        read_mesh(path)
+
+
 @pytest.mark.parametrize("keyword", ["NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "IMPORT", "PARAMETER"])
 def test_keywords_that_change_the_mesh_are_refused_by_name(tmp_path, keyword):
     path = deck(tmp_path, f"*{keyword[:2].lower()}{keyword[2:]}, NSET=A", "1, 3, 1")

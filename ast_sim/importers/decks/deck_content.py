@@ -332,6 +332,10 @@ def _placement(keyword: Keyword) -> tuple[np.ndarray, np.ndarray]:
             f"{keyword.data[0].place}: the first line of an instance is its shift, three numbers: write 0, 0, 0 before"
             " the line of a rotation"
         )
+    if len(rows) == 2 and len(tokens(keyword.data[1])) != 7:
+        raise DatasetError(
+            f"{keyword.data[1].place}: a rotation has two points of its axis and an angle, seven numbers"
+        )
     shift = np.array(rows[0][:3]) if rows else np.zeros(3)
     if len(rows) < 2:
         return np.eye(3), shift
