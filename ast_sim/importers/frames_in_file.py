@@ -90,7 +90,8 @@ def _by_meshio(path: Path, copy: Path | None = None) -> SourceMesh:
 def _require_cartesian(path: Path) -> None:
     """Raise DatasetError if the coordinates of a MED file are cylindrical or spherical: meshio reads over it."""
     with contextlib.suppress(OSError, KeyError, AttributeError), h5py.File(path, "r") as file:
-        for name, mesh in file["ENS_MAA"].items():
+        meshes: Any = file["ENS_MAA"]
+        for name, mesh in meshes.items():
             if mesh.attrs.get("REP", 0) != 0:
                 raise DatasetError(f"{path}: the coordinates of {name} are not along x, y and z: write Cartesian ones")
 
