@@ -150,8 +150,9 @@ def _add_generate(generate: Parser) -> None:
 
 def _add_convert(convert: Parser) -> None:
     about = (
-        "a simulation (a .vtkhdf, .frd, .xdmf, .exo or d3plot file, a .pvd file, or a folder of .vtu, .pvtu or .vtk"
-        " files), a folder that holds several simulations, or a folder of meta.json and .tfrecord files"
+        "a simulation (a .vtkhdf, .frd, .xdmf, .exo or d3plot file, a .pvd or .series file, or a folder of .vtu,"
+        " .pvtu, .vtm or .vtk files), a folder that holds several simulations, or a folder of meta.json and"
+        " .tfrecord files"
     )
     convert.add_argument("source", type=path, metavar="SOURCE", help=about)
     about = "results (.frd) of the job whose deck (.inp) is SOURCE: its prescribed nodes and materials are taken"

@@ -14,7 +14,7 @@ from ast_sim.dataset.layout import SPLITS
 from ast_sim.dataset.writer import FittedWriter
 from ast_sim.importers.completeness import require_complete
 from ast_sim.importers.deepmind import convert_deepmind, is_deepmind
-from ast_sim.importers.frame_order import files_of_frames, natural_order
+from ast_sim.importers.frame_order import SERIES, files_of_frames, natural_order
 from ast_sim.importers.frames_in_file import ONE_FRAME, WITH_FRAMES, holds_frames
 from ast_sim.importers.job_files import decks_of, doubt_modulus, with_units
 from ast_sim.importers.series import FieldNames, read_series
@@ -189,11 +189,12 @@ def find_series(source: Path) -> dict[str, Path]:
 
 
 def _series_in(folder: Path) -> Iterator[Path]:
-    """The simulations in a folder. If it holds files with all frames or .pvd files, only these count: .pvd files list
-    files of frames."""
+    """The simulations in a folder. If it holds files with all frames or .pvd files, only these count; else .series
+    files, if there are any: both list files of frames."""
     entries = sorted(folder.iterdir(), key=natural_order)
     files = [entry for entry in entries if entry.is_file() and not entry.name.startswith(".")]
     collections = [entry for entry in files if entry.suffix.lower() == ".pvd" or holds_frames(entry)]
+    collections = collections or [entry for entry in files if entry.suffix.lower() == SERIES]
     if collections:
         yield from collections
     elif files_of_frames(folder):

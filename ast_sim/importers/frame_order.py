@@ -1,7 +1,9 @@
-"""The files of a simulation in order of time: by the times inside, else by the numbers in their names; PVD files."""
+"""The files of a simulation in order of time: by the times inside, else by the numbers in their names; PVD files, and
+the .series files of ParaView."""
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 from typing import NamedTuple
@@ -12,7 +14,13 @@ import numpy as np
 from ast_sim.importers.frames_in_file import ONE_FRAME, holds_frames
 from ast_sim.support.errors import DatasetError
 
+# ParaView's files that list the files of frames with their times: run.vtu.series beside run_0.vtu.
+SERIES = ".series"
+
 _NUMBER = re.compile(r"([0-9]+(?:\.[0-9]+)?(?:[eE][-+]?[0-9]+)?)")
+
+
+Part = tuple[str, float, str]
 
 
 class FrameFiles(NamedTuple):
@@ -43,18 +51,20 @@ def frame_files(source: Path) -> FrameFiles:
         raise DatasetError(f"{source}: there is no such file or folder")
     if source.suffix.lower() == ".pvd":
         return _collection(source)
+    if source.suffix.lower() == SERIES:
+        return _series(source)
     if source.suffix.lower() in ONE_FRAME or holds_frames(source):
         return FrameFiles([[source]])
     raise DatasetError(
-        f"{source}: must be a .pvd file, a folder of files of frames ({', '.join(ONE_FRAME)}), or one file with all"
-        " frames, such as .vtkhdf, .frd, .xdmf or .exo"
+        f"{source}: must be a .pvd or .series file, a folder of files of frames ({', '.join(ONE_FRAME)}), or one file"
+        " with all frames, such as .vtkhdf, .frd, .xdmf or .exo"
     )
 
 
 def files_of_frames(folder: Path) -> list[Path]:
     """The files of a folder that are a frame each. Pieces that a .pvtu or .vtm file lists are not counted."""
     entries = [entry for entry in folder.iterdir() if entry.is_file() and not entry.name.startswith(".")]
-    for endings in ((".pvtu",), (".vtm",), (".vtu",), (".vtk",), (".pvtp",), (".vtp",)):
+    for endings in ((".pvtu",), (".vtm", ".vtmb"), (".vtu",), (".vtk",), (".pvtp",), (".vtp",)):
         files = [entry for entry in entries if entry.suffix.lower() in endings]
         if files:
             return files
@@ -126,27 +136,58 @@ def _collection(source: Path) -> FrameFiles:
     times = [time for time, _, _ in entries]
     if len(entries) > 1 and not np.isfinite(times).all():
         raise DatasetError(f"{source}: every frame needs a timestep")
-    frames: dict[float, list[tuple[tuple[str, float], Path]]] = {}
+    frames: dict[float, list[tuple[Part, Path]]] = {}
     for time, part, name in sorted(entries, key=lambda one: one[0]):
         frames.setdefault(time, []).append((part, _listed(source, name)))
     counts = {len(files) for files in frames.values()}
     if len(counts) > 1:
         raise DatasetError(f"{source}: lists {min(counts)} to {max(counts)} files for a time; must be equally many")
-    if all(len({part for part, _ in files}) == len(files) for files in frames.values()) and counts != {1}:
-        frames = {time: sorted(files) for time, files in frames.items()}
-        if len({tuple(part for part, _ in files) for files in frames.values()}) > 1:
-            raise DatasetError(f"{source}: lists other parts for one time than for another")
+    if counts != {1}:
+        frames = _parts_in_order(source, frames)
     ordered_files = [[file for _, file in files] for files in frames.values()]
     return FrameFiles(ordered_files, list(frames) if len(frames) > 1 else None)
 
 
-def _part(entry: ElementTree.Element) -> tuple[str, float]:
-    """The group and the number of a part of a frame."""
-    return entry.get("group", ""), float(entry.get("part", "0"))
+def _part(entry: ElementTree.Element) -> Part:
+    """What a PVD file says of a part of a frame: its group, its number and its name."""
+    return entry.get("group", ""), float(entry.get("part", "0")), entry.get("name", "")
+
+
+def _parts_in_order(source: Path, frames: dict[float, list[tuple[Part, Path]]]) -> dict[float, list[tuple[Part, Path]]]:
+    """The files of each frame in the order of their parts. If the PVD file does not tell the parts apart, the names of
+    the files without their numbers do, if they can."""
+    if all(len({part for part, _ in files}) == len(files) for files in frames.values()):
+        if len({frozenset(part for part, _ in files) for files in frames.values()}) > 1:
+            raise DatasetError(f"{source}: lists other parts for one time than for another")
+        return {time: sorted(files) for time, files in frames.items()}
+    words = {time: {_words(file): one for one in files for file in one[1:]} for time, files in frames.items()}
+    if (
+        any(len(words[time]) < len(files) for time, files in frames.items())
+        or len({*map(frozenset, words.values())}) > 1
+    ):
+        return frames
+    return {time: [of_words[key] for key in sorted(of_words)] for time, of_words in words.items()}
+
+
+def _words(file: Path) -> tuple[str, ...]:
+    return tuple(_NUMBER.split(file.name)[::2])
+
+
+def _series(source: Path) -> FrameFiles:
+    """The files that a .series file of ParaView lists, by their time."""
+    try:
+        entries = [(float(one["time"]), str(one["name"])) for one in json.loads(source.read_text("utf-8"))["files"]]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DatasetError(f"{source}: is damaged or no .series file of ParaView: {error!r}") from error
+    times = [time for time, _ in entries]
+    if not entries or not np.isfinite(times).all() or len(set(times)) < len(times):
+        raise DatasetError(f"{source}: must list files of frames, each with a time of its own; it has {times[:6]}")
+    entries.sort()
+    return FrameFiles([[_listed(source, name)] for _, name in entries], sorted(times) if len(times) > 1 else None)
 
 
 def _listed(source: Path, name: str) -> Path:
-    """A file that a PVD file lists; Windows writes its path with backslashes."""
+    """A file that a PVD or .series file lists; Windows writes its path with backslashes."""
     file = source.parent / name
     if not file.is_file() and "\\" in name:
         file = source.parent / name.replace("\\", "/")

@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 
 from ast_sim.importers.decks.deck_mesh import deck_mesh
@@ -24,7 +25,7 @@ from ast_sim.support.errors import DatasetError
 WITH_FRAMES = (".vtkhdf", ".frd", ".xdmf", ".xmf", ".e", ".ex2", ".exo", ".exoii", ".exii")
 
 # Formats in which each frame is a file of its own.
-ONE_FRAME = (".vtu", ".pvtu", ".vtk", ".vtp", ".pvtp", ".vtm")
+ONE_FRAME = (".vtu", ".pvtu", ".vtk", ".vtp", ".pvtp", ".vtm", ".vtmb")
 
 
 def holds_frames(path: Path) -> bool:
@@ -75,6 +76,8 @@ def _by_meshio(path: Path, copy: Path | None = None) -> SourceMesh:
     """Read a file, or its copy, by meshio. On a damaged file meshio may raise any error, print, or raise SystemExit."""
     import meshio
 
+    if path.suffix.lower() == ".med":
+        _require_cartesian(path)
     printed = io.StringIO()
     try:
         with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
@@ -82,6 +85,15 @@ def _by_meshio(path: Path, copy: Path | None = None) -> SourceMesh:
     except (Exception, SystemExit) as error:
         raise DatasetError(f"{path}: cannot be read as a mesh: {_told(error, printed.getvalue())}") from error
     return from_meshio(mesh, path)
+
+
+def _require_cartesian(path: Path) -> None:
+    """Raise DatasetError if the coordinates of a MED file are cylindrical or spherical: meshio reads over it."""
+    with contextlib.suppress(OSError, KeyError, AttributeError), h5py.File(path, "r") as file:
+        meshes: Any = file["ENS_MAA"]
+        for name, mesh in meshes.items():
+            if mesh.attrs.get("REP", 0) != 0:
+                raise DatasetError(f"{path}: the coordinates of {name} are not along x, y and z: write Cartesian ones")
 
 
 def _told(error: BaseException, printed: str = "") -> str:
@@ -104,12 +116,14 @@ def _xdmf_frames(path: Path) -> Iterator[SourceMesh]:
         tree = ET.parse(path)
     except (ET.ParseError, OSError, ValueError, LookupError) as error:
         raise DatasetError(f"{path}: cannot be read as a mesh: it is no XML: {error}") from error
+    _require_understood(path, tree)
     series = tree.findall("Domain/Grid[@GridType='Collection']")
     with _beside(path, tree) as copy:
         if not series:
             yield _by_meshio(path, copy)
             return
         _require_plain(path, series)
+        _require_no_other(path, tree, series[0])
         try:
             with meshio.xdmf.TimeSeriesReader(copy) as reader:
                 shared = reader.read_points_cells()
@@ -133,6 +147,28 @@ def _own_mesh(reader: Any, grid: ET.Element, shared: tuple[Any, Any]) -> tuple[A
     reader.mesh_grid = grid
     points, cells = reader.read_points_cells()
     return shared[0] if points is None else points, cells or shared[1]
+
+
+def _require_understood(path: Path, tree: ET.ElementTree[Any]) -> None:
+    """Raise DatasetError if nodes are not counted from 0, or a grid has a field twice: meshio reads over it."""
+    for topology in tree.iter("Topology"):
+        if topology.get("BaseOffset", "0").strip() not in ("", "0"):
+            raise DatasetError(
+                f"{path}: counts its nodes from {topology.get('BaseOffset')} (BaseOffset); must be from 0"
+            )
+    for grid in tree.iter("Grid"):
+        fields = [(one.get("Name"), one.get("Center", "Node")) for one in grid.findall("Attribute")]
+        twice = next((name for name, center in fields if fields.count((name, center)) > 1), None)
+        if twice is not None:
+            raise DatasetError(f"{path}: a grid has the field {twice!r} twice")
+
+
+def _require_no_other(path: Path, tree: ET.ElementTree[Any], series: ET.Element) -> None:
+    """Raise DatasetError if a grid stands beside a series that does not refer to it."""
+    beside = [grid for grid in tree.findall("Domain/Grid") if grid is not series]
+    refers = any(item.tag.endswith("include") or item.get("Reference") for item in series.iter())
+    if beside and not refers:
+        raise DatasetError(f"{path}: holds a grid beside the series of frames: write all bodies into one grid")
 
 
 def _require_plain(path: Path, series: list[ET.Element]) -> None:

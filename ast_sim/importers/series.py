@@ -17,7 +17,7 @@ from ast_sim.importers.frame_order import frame_files, ordered
 from ast_sim.importers.frames_in_file import frames_in
 from ast_sim.importers.mesh_file import MeshFile, mesh_of, raw_field
 from ast_sim.importers.scene_mesh import clamped
-from ast_sim.importers.solids.frames_match import order_of_cells
+from ast_sim.importers.solids.frames_match import in_order_of, order_of_cells
 from ast_sim.importers.solids.kept_fields import KeptFields
 from ast_sim.importers.solids.mesh_elements import require_extent
 from ast_sim.importers.solids.positions import far_origin, rest_and_position, warn_of_rounding, with_layers
@@ -193,8 +193,10 @@ def _read_frames(
             first = frame
             stitching = Stitching(frame)
             place, order, notes = _stress_place(frame, names)
+        frame, said = in_order_of(frame, first)
+        notes += said
         cells = order_of_cells(frame, first)
-        if cells is not None and len(notes) < 2:
+        if cells is not None and not said and len(notes) < 2:
             notes.append(
                 f"the elements of {frame.path.name} stand in another order: they are reordered as in the first"
             )
@@ -243,6 +245,8 @@ def _displacement(frame: SourceMesh, names: FieldNames) -> np.ndarray | None:
     value = raw_field(frame, "point", names.displacement or "displacement")
     if value.shape[1] not in (2, 3):
         raise DatasetError(f"{frame.path}: the displacement has {value.shape[1]} components; must have 2 or 3")
+    if value.shape[1] == 2 and any(block.dimension == 3 for block in frame.blocks):
+        raise DatasetError(f"{frame.path}: the displacement of a body with a volume has 2 components; must have 3")
     return np.pad(value, ((0, 0), (0, 3 - value.shape[1])))
 
 

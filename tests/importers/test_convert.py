@@ -484,7 +484,7 @@ def test_a_source_that_is_none_is_named(tmp_path):
     for name, message in [
         ("empty", "neither the folder nor a folder in it holds files of results: .pvd, .vtkhdf"),
         ("absent", "there is no such file or folder"),
-        ("x.stl", "must be a .pvd file, a folder of files of frames .*, or one file with all frames"),
+        ("x.stl", "must be a .pvd or .series file, a folder of files of frames .*, or one file with all frames"),
     ]:
         with pytest.raises(DatasetError, match=f"{tmp_path / name}: .*{message}"):
             convert(tmp_path / name, tmp_path / "d.h5", splits={"train": 1})

@@ -315,3 +315,43 @@ def test_obstacles_need_no_stress(bodies, tmp_path):
     read = read_series(results, NAMES, deck=job)
     assert np.array_equal(read.stress[:, :18], all_of_it.stress[:, :18]) and not read.stress[:, 18:].any()
     assert "the stress is NaN at 8 rows of obstacles: it is 0 there" in read.attributes["notes"]
+
+
+@pytest.mark.parametrize("number", [" 1.00000D-03", "************"])
+def test_what_is_no_number_in_results_is_not_0(press, tmp_path, number):
+    text = press[1].read_text()
+    place = text.index("\n -1", text.index(" -4  DISP")) + len("\n -1") + 10
+    path = tmp_path / "job.frd"
+    path.write_text(text[:place] + number + text[place + 12 :])
+    with pytest.raises(
+        DatasetError, match=r"job.frd: cannot be read as results of CalculiX: no number in the line '-1 "
+    ):
+        read_series(path, NAMES, deck=press[0])
+
+
+def test_vibrations_are_no_frames(press, tmp_path):
+    path = tmp_path / "job.frd"
+    path.write_text(press[1].read_text().replace(" -4  STRESS  ", " -4  DISPI   "))
+    with pytest.raises(DatasetError, match=r"job.frd: holds DISPI, the displacement of a vibration at a frequency"):
+        read_series(path, NAMES, deck=press[0])
+
+
+@pytest.mark.parametrize("order", [1, -1])
+@pytest.mark.parametrize("keyword", ["CREEP", "VISCOELASTIC, TIME=PRONY", "DRUCKER PRAGER"])
+def test_a_material_with_another_law_has_no_columns(press, tmp_path, keyword, order):
+    text = press[0].read_text()
+    lines = ["*ELASTIC\n100., 0.4\n", f"*{keyword}\n1., 2., 3.\n"]
+    assert lines[0] in text
+    path = tmp_path / "job.inp"
+    path.write_text(text.replace(lines[0], "".join(lines[::order])))
+    read = read_series(press[1], NAMES, deck=path)
+    assert read.scene.material is None
+    assert f"has *{keyword.partition(',')[0].replace(' ', '')}; " in read.attributes["notes"]
+
+
+@pytest.mark.parametrize("directions", ["0, 3", "3, 1"])
+def test_directions_that_there_are_not_are_refused(press, tmp_path, directions):
+    path = tmp_path / "job.inp"
+    path.write_text(press[0].read_text().replace("FLOOR, 1, 3", f"FLOOR, {directions}"))
+    with pytest.raises(DatasetError, match=rf"job.inp:\d+: holds the directions {directions.replace(', ', ' to ')}"):
+        read_series(press[1], NAMES, deck=path)

@@ -92,11 +92,44 @@ def test_an_instance_is_moved_and_then_turned_counter_clockwise(tmp_path):
     np.testing.assert_allclose(points, [[2, 5, 0], [2, 6, 0], [1, 5, 0], [2, 5, 1]], atol=1e-12)
 
 
+@pytest.mark.parametrize("line", ["0, 0, 0, 0, 0, 1", "0, 0, 5"])
+def test_a_rotation_without_an_angle_is_refused(tmp_path, line):
+    path = tmp_path / "deck.inp"
+    nodes = "1, 0, 0, 0\n2, 1, 0, 0\n3, 0, 1, 0\n4, 0, 0, 1\n*ELEMENT, TYPE=C3D4\n1, 1, 2, 3, 4"
+    part = f"*PART, NAME=A\n*NODE\n{nodes}\n*END PART\n"
+    path.write_text(f"{part}*INSTANCE, NAME=C, PART=A\n5, 0, 0\n{line}\n*END INSTANCE\n")
+    with pytest.raises(DatasetError, match=r"deck.inp:12: a rotation has two points of its axis and an angle"):
+        read_mesh(path)
+
+
 @pytest.mark.parametrize("keyword", ["NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "IMPORT", "PARAMETER"])
 def test_keywords_that_change_the_mesh_are_refused_by_name(tmp_path, keyword):
     path = deck(tmp_path, f"*{keyword[:2].lower()}{keyword[2:]}, NSET=A", "1, 3, 1")
     with pytest.raises(DatasetError, match=rf"deck.inp:\d+: \*{keyword}: this keyword changes the mesh"):
         read_mesh(path)
+
+
+@pytest.mark.parametrize(
+    ("line", "cause"),
+    [
+        ("*", "a single asterisk; a comment begins with two"),
+        ("* the other half", r"the elements after this line seem to belong to \*ELEMENT in line 20; a comment"),
+        ("*ELEMNT, TYPE=C3D4", r"is this \*ELEMENT\?"),
+        ("*ELEMENTS, TYPE=C3D4", r"is this \*ELEMENT\?"),
+    ],
+)
+def test_elements_behind_a_line_that_is_no_keyword_are_not_lost(tmp_path, line, cause):
+    path = deck(tmp_path)
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([*lines[:30], line, *lines[30:]]) + "\n")
+    with pytest.raises(DatasetError, match=rf"deck.inp:31: \*\w*: {cause}"):
+        read_mesh(path)
+
+
+@pytest.mark.parametrize("keyword", ["BOUNDARY", "SPRING", "MEMBRANE SECTION"])
+def test_keywords_behind_elements_are_no_elements(tmp_path, keyword):
+    path = deck(tmp_path, "*ELEMENT, TYPE=S3", "1001, 1, 2, 3", f"*{keyword}", "5, 1, 3, 0", "*", "** a comment")
+    assert len(read_mesh(path).elements) == TETRAHEDRA
 
 
 @pytest.mark.parametrize("lines", [("*ELEMENT, TYPE=C3D99", "1001, 1, 2"), ("*ELEMENT, TYPE=U1", "1001, 1, 2")])

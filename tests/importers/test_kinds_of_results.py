@@ -1,6 +1,7 @@
 """Kinds of result files that once came in wrong or without a word: sets of nodes, parts in another order, moving
 geometry, results of some nodes only."""
 
+import h5py
 import meshio
 import numpy as np
 import pytest
@@ -200,3 +201,51 @@ def test_binary_numbers_of_xdmf_that_meshio_would_misread_are_refused(tmp_path, 
     path.write_text(path.read_text().replace('Format="Binary"', f'Format="Binary" {how}'))
     with pytest.raises(DatasetError, match="binary numbers must be plain ones of this machine"):
         read_mesh(path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "cause"),
+    [
+        ("<Topology ", '<Topology BaseOffset="1" ', r"counts its nodes from 1 \(BaseOffset\)"),
+        ("</Grid></Grid>", "</Grid></Grid><Grid/>", "holds a grid beside the series of frames"),
+        (
+            '<Attribute Name="von_mises"',
+            '<Attribute Name="von_mises" Center="Cell"/>' * 2 + '<Attribute Name="x"',
+            "twice",
+        ),
+    ],
+)
+def test_what_meshio_reads_over_in_xdmf_is_refused(tmp_path, old, new, cause):
+    path = tmp_path / "all.xdmf"
+    write_xdmf(path, 3 * [np.arange(len(PAD.elements))])
+    path.write_text(path.read_text().replace(old, new))
+    with pytest.raises(DatasetError, match=f"all.xdmf: .*{cause}"):
+        read_series(path, FieldNames(handle="0:zmin"))
+
+
+def test_coordinates_of_med_that_are_not_cartesian_are_refused(tmp_path):
+    path = tmp_path / "mesh.med"
+    meshio.Mesh(PAD.rest_position, [("tetra", PAD.elements)]).write(path)
+    assert len(read_mesh(path).points) == N
+    with h5py.File(path, "r+") as file:
+        file["ENS_MAA/mesh"].attrs["REP"] = 1
+    with pytest.raises(DatasetError, match="mesh.med: the coordinates of mesh are not along x, y and z"):
+        read_mesh(path)
+
+
+def test_a_displacement_in_the_plane_moves_no_body_with_a_volume(tmp_path):
+    for frame in range(2):
+        write_frame(tmp_path / f"f{frame}.vtu", CUBE.rest_position, displacement=np.full((8, 2), 0.1 * frame))
+    with pytest.raises(DatasetError, match="f0.vtu: the displacement of a body with a volume has 2 components"):
+        read_series(tmp_path, FieldNames(handle="0:zmin"))
+
+
+def test_groups_of_gmsh_2_with_negative_numbers_and_names_of_windows(tmp_path):
+    """A negative number says that the elements of a group are turned over."""
+    nodes = "\n".join(f"{1 + row} {x} {y} {z}" for row, (x, y, z) in enumerate(CUBE.rest_position.tolist()))
+    cells = "\n".join(f"{1 + row} 4 2 -7 1 {' '.join(map(str, 1 + c))}" for row, c in enumerate(CUBE.elements))
+    text = '$MeshFormat\n2.2 0 8\n$EndMeshFormat\n$PhysicalNames\n1\n3 7 "Klötze"\n$EndPhysicalNames\n'
+    text += f"$Nodes\n8\n{nodes}\n$EndNodes\n$Elements\n{len(CUBE.elements)}\n{cells}\n$EndElements\n"
+    for encoding in ("utf-8", "latin-1"):
+        (tmp_path / "mesh.msh").write_bytes(text.encode(encoding))
+        assert {name: len(group) for name, group in read_mesh(tmp_path / "mesh.msh").groups.items()} == {"Klötze": 8}

@@ -6,6 +6,7 @@ error that names it. Keywords that say something else (materials, loads, steps) 
 
 from __future__ import annotations
 
+import difflib
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -37,6 +38,9 @@ _OPTIONS = {
     "SYSTEM": set(),
     **dict.fromkeys(("ENDPART", "ENDASSEMBLY", "ENDINSTANCE"), set()),
 }
+
+# Words that are as alike as ELEMENT and ELEMENTS are taken for slips of the pen.
+_ALIKE = 0.85
 
 # A node or an element: the instance that it belongs to ("" for the scope itself), and its number.
 Members = list[tuple[str, np.ndarray]]
@@ -111,6 +115,7 @@ class _Reader:
         self.deck = deck
         self.content = deck.root
         self.system: np.ndarray | None = None
+        self.before: Keyword | None = None
         self.handlers: dict[str, Callable[[Keyword], None]] = {
             "NODE": self._node,
             "ELEMENT": self._element,
@@ -137,7 +142,24 @@ class _Reader:
         elif len(name) > 2 and any(known.startswith(name) for known in (*_OPTIONS, *_CHANGE_THE_MESH)):
             raise keyword.error("is this a short form? Write the whole keyword")
         else:
-            self.deck.ignored[name] += 1
+            self._ignore(keyword)
+        self.before = keyword
+
+    def _ignore(self, keyword: Keyword) -> None:
+        """Pass over a keyword, unless its data lines seem to belong to the mesh: after a comment with one asterisk
+        instead of two, the elements of a block would be lost."""
+        if not keyword.name and keyword.data:
+            raise keyword.error("a single asterisk; a comment begins with two")
+        like = difflib.get_close_matches(keyword.name, _OPTIONS, 1, _ALIKE)
+        if like and keyword.data:
+            raise keyword.error(f"is this *{like[0]}?")
+        if self.before is not None and self.before.name == "ELEMENT" and _goes_on(self.before, keyword):
+            raise keyword.error(
+                f"the elements after this line seem to belong to *ELEMENT in line {self.before.line.number}; a comment"
+                " begins with two asterisks"
+            )
+        if keyword.name:
+            self.deck.ignored[keyword.name] += 1
 
     def _key(self, name: str) -> str:
         key = name.upper()
@@ -264,6 +286,16 @@ class _Reader:
         self.content = self.deck.root
 
 
+def _goes_on(block: Keyword, other: Keyword) -> bool:
+    """Whether the data lines of another keyword look like further elements of a block: five whole numbers or more, as
+    many in a line, and the first one of each line is of no element of the block."""
+    rows, further = ([tokens(line) for line in keyword.data] for keyword in (block, other))
+    widths = {len(row) for row in rows if len(row) > 4}  # a line of *BOUNDARY has up to four
+    numbers = {row[0] for row in rows if row}
+    alike = (len(row) in widths and row[0] not in numbers and "".join(row).isdigit() for row in further)
+    return bool(further) and all(alike)
+
+
 def _generated(keyword: Keyword) -> np.ndarray:
     """The numbers of lines `first, last, step`."""
     parts = [np.zeros(0, np.int64)]
@@ -299,6 +331,10 @@ def _placement(keyword: Keyword) -> tuple[np.ndarray, np.ndarray]:
         raise DatasetError(
             f"{keyword.data[0].place}: the first line of an instance is its shift, three numbers: write 0, 0, 0 before"
             " the line of a rotation"
+        )
+    if len(rows) == 2 and len(tokens(keyword.data[1])) != 7:
+        raise DatasetError(
+            f"{keyword.data[1].place}: a rotation has two points of its axis and an angle, seven numbers"
         )
     shift = np.array(rows[0][:3]) if rows else np.zeros(3)
     if len(rows) < 2:

@@ -24,6 +24,7 @@ _HEADER = re.compile(
     rb" -4  (?P<name>.{8})[^\n]*\n(?P<columns>(?: -5[^\n]*\n)*)",
     re.MULTILINE,
 )
+_NO_NUMBER = re.compile(rb"^ -[12][^\n]*[*dDqQ,;][^\n]*", re.MULTILINE)  # stars: more digits than there is room for
 _MODES = {b"2": "modes of vibration", b"4": "modes of buckling"}
 _TEXT_WIDTHS = {0: 5, 1: 10}  # of the number of a node, by format
 _BINARY_WIDTHS = {2: 4, 3: 8}  # of a value, by format
@@ -56,16 +57,25 @@ def read_frd_headers(path: Path) -> tuple[list[int], list[FrdResult]]:
     """The numbers of nodes and elements that a file declares, and its results.
 
     Raises:
-        DatasetError: the results are modes, which are no frames of a motion, or two increments have the same time.
+        DatasetError: the results are modes or vibrations, which are no frames of a motion, two increments have the same
+            time, or a line holds what is no number.
     """
     try:
         with _opened(path) as content:
             counts = [_declared(content, key) for key in (b"2C", b"3C")]
             headers = [(header.groupdict(), header.end()) for header in _HEADER.finditer(content)]
-        results = [_result(header, end) for header, end in headers]
+            results = [_result(header, end) for header, end in headers]
+            wrong = _no_number(content, results)
     except (OSError, ValueError) as error:
         told = " ".join(str(error).split())
         raise DatasetError(f"{path}: cannot be read as results of CalculiX: it is damaged: {told}") from error
+    if wrong is not None:
+        raise DatasetError(f"{path}: cannot be read as results of CalculiX: no number in the line {wrong!r}")
+    imaginary = next((result.name for result in results if result.name in ("DISPI", "PDISP")), None)
+    if imaginary is not None:
+        raise DatasetError(
+            f"{path}: holds {imaginary}, the displacement of a vibration at a frequency, which is no frame of a motion"
+        )
     modes = next((header["kind"].strip() for header, _ in headers if header["kind"].strip() in _MODES), None)
     if modes is not None:
         raise DatasetError(
@@ -80,6 +90,17 @@ def read_frd_headers(path: Path) -> tuple[list[int], list[FrdResult]]:
                 " time go on from step to step (no TIME RESET), and write increments that differ by more than rounding"
             )
     return counts, results
+
+
+def _no_number(content: mmap.mmap, results: list[FrdResult]) -> str | None:
+    """The first line of results as text that holds something else than numbers, which a reader may take for 0."""
+    for result in results:
+        if result.format in _TEXT_WIDTHS:
+            end = content.find(b"\n -3", result.start - 1)
+            line = _NO_NUMBER.search(content, result.start, end if end >= 0 else len(content))
+            if line is not None:
+                return line[0].decode(errors="replace").strip()
+    return None
 
 
 def partly_given(path: Path, results: list[FrdResult], nodes: int) -> Iterator[tuple[FrdResult, np.ndarray]]:

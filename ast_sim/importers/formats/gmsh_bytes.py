@@ -27,9 +27,12 @@ class Section:
         end = self.content.find(b"\n", self.place)
         if end < 0:
             raise ValueError("it ends within a section")
-        text = self.content[self.place : end].decode(errors="replace").strip()
+        line = self.content[self.place : end]
         self.place = end + 1
-        return text
+        try:
+            return line.decode().strip()
+        except UnicodeDecodeError:  # a name of a group, as Windows writes it
+            return line.decode("latin-1").strip()
 
     def skip(self) -> None:
         self.place = self._find_end()

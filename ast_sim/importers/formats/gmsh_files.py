@@ -198,6 +198,7 @@ def _elements_2(section: Section, content: _Content) -> None:
         by_kind[kind].append(padded)
     for kind, parts in by_kind.items():
         rows = np.concatenate(parts)
+        rows[:, 1] = np.abs(rows[:, 1])  # a negative group: its elements are turned over
         dimension = CellBlock(kind, rows[:0], kind).dimension
         groups = [
             (dimension, group, np.flatnonzero(rows[:, 1] == group)) for group in np.unique(rows[:, 1]).tolist() if group

@@ -8,7 +8,7 @@ text} is the answer if the file is refused, with "missing" if a package is not i
 
 The answer: "steps" (how many frames the file holds), "time", and "pieces". Each piece has the arrays `points` [n, 3],
 `types` [c], `offsets` [c + 1], `connectivity` (VTK's types and order of nodes), `point NAME`, `cell NAME`, `global`,
-and the sets of nodes of Exodus as `group NAME`.
+`block` (the name of the block that it is), and the sets of nodes of Exodus as `group NAME`.
 """
 
 from __future__ import annotations
@@ -29,12 +29,9 @@ from typing import Any
 import numpy as np
 
 from ast_sim.importers.formats.frd_results import partly_given, read_frd_headers
+from ast_sim.importers.formats.vtk_data import Part, Refused, arrays_of, parts_of, time_of
 
 _ENDINGS_OF_EXODUS = {".e", ".ex2", ".exo", ".exoii", ".exii", ".g", ".gen"}
-
-
-class Refused(Exception):
-    """VTK cannot read a file. The text says why."""
 
 
 def main() -> None:
@@ -122,8 +119,9 @@ def _read(path: Path, step: int) -> tuple[dict[str, Any], list[dict[str, np.ndar
         file.set_step(step)  # by its number: times may stand in a file twice
     file.reader.Update()
     data = file.reader.GetOutputDataObject(0)
-    time = _time_of(data) if file.set_step is None else file.times[step]
-    return {"steps": len(file.times), "time": time, **file.facts}, [_arrays_of(part) for part in _parts(data)]
+    parts = parts_of(data)
+    time = time_of(data, parts) if file.set_step is None else file.times[step]
+    return {"steps": len(file.times), "time": time, **file.facts}, [arrays_of(part) for part in parts]
 
 
 @dataclass
@@ -148,7 +146,7 @@ class _Results:
     def frame(self, step: int) -> dict[str, np.ndarray]:
         if self.times[step] is not None:
             self.reader.set_active_time_point(step)
-        arrays = _arrays_of((self.reader.read(), ""))
+        arrays = arrays_of(Part(self.reader.read()))
         arrays["global"] = arrays.pop("point original_node_ids")
         for result, nodes in self.partial.get(self.times[step] or 0.0, []):
             for name in arrays:  # also STRESS_Mises, which the reader computes; it fills with zeros
@@ -261,82 +259,6 @@ def _dyna(path: Path) -> _Opened:
         for index in range(getattr(reader, f"GetNumberOf{kind}Arrays")()):
             getattr(reader, f"Set{kind}ArrayStatus")(index, 1)
     return _Opened(reader, _times(reader), reader.SetTimeStep)
-
-
-def _time_of(data: Any) -> float | None:
-    from vtkmodules.util.numpy_support import vtk_to_numpy
-
-    facts = data.GetFieldData()
-    arrays = [facts.GetArray(index) for index in range(facts.GetNumberOfArrays())] if facts is not None else []
-    named = {(array.GetName() or "").lower(): array for array in arrays if array is not None}  # None: a text
-    for name in ("timevalue", "time_value", "time"):
-        if name in named and named[name].GetNumberOfValues() == 1:
-            return float(vtk_to_numpy(named[name]).ravel()[0])
-    return None
-
-
-def _parts(data: Any, name: str = "", in_sets: bool = False) -> list[tuple[Any, str]]:
-    """The meshes of a data set of blocks; (mesh, name of the set of nodes) for the sets of nodes of Exodus."""
-    from vtkmodules.vtkCommonDataModel import vtkCompositeDataSet, vtkDataSet, vtkMultiBlockDataSet
-
-    if isinstance(data, vtkDataSet):
-        return [(data, name if in_sets else "")]
-    if not isinstance(data, vtkCompositeDataSet):
-        raise Refused(f"holds a {data.GetClassName().removeprefix('vtk') if data is not None else 'nothing'}, no mesh")
-    parts = []
-    if isinstance(data, vtkMultiBlockDataSet):
-        for index in range(data.GetNumberOfBlocks()):
-            block = data.GetBlock(index)
-            facts = data.GetMetaData(index) if data.HasMetaData(index) else None
-            label = (facts.Get(vtkCompositeDataSet.NAME()) if facts is not None else None) or ""
-            if block is not None:
-                parts += _parts(block, label, in_sets or label == "Node Sets")
-        return parts
-    iterator = data.NewIterator()
-    while not iterator.IsDoneWithTraversal():
-        parts += _parts(iterator.GetCurrentDataObject(), name, in_sets)
-        iterator.GoToNextItem()
-    return parts
-
-
-def _arrays_of(part: tuple[Any, str]) -> dict[str, np.ndarray]:
-    from vtkmodules.vtkCommonDataModel import vtkUnstructuredGrid
-    from vtkmodules.vtkFiltersCore import vtkAppendFilter
-
-    data, of_set = part
-    if of_set:
-        ids = _numpy(data.GetPointData().GetGlobalIds())
-        return {} if ids is None else {f"group {of_set}": ids}
-    if not isinstance(data, vtkUnstructuredGrid):
-        append = vtkAppendFilter()
-        append.AddInputData(data)
-        append.Update()
-        data = append.GetOutput()
-    arrays = {"points": np.zeros((0, 3)), "types": np.zeros(0, np.uint8), "connectivity": np.zeros(0, np.int64)}
-    arrays["offsets"] = np.zeros(1, np.int64)
-    if data.GetNumberOfPoints():
-        arrays["points"] = _numpy(data.GetPoints().GetData())
-    if data.GetNumberOfCells():
-        cells = data.GetCells()
-        arrays["types"] = _numpy(data.GetCellTypes())
-        arrays["offsets"] = _numpy(cells.GetOffsetsArray()).astype(np.int64)
-        arrays["connectivity"] = _numpy(cells.GetConnectivityArray()).astype(np.int64)
-    for place, fields in (("point", data.GetPointData()), ("cell", data.GetCellData())):
-        for index in range(fields.GetNumberOfArrays()):
-            array = fields.GetArray(index)  # None for text
-            if array is not None and array.GetName():
-                arrays[f"{place} {array.GetName()}"] = _numpy(array)
-                names = [array.GetComponentName(c) or "" for c in range(array.GetNumberOfComponents())]
-                if any(names):
-                    arrays[f"{place}-columns {array.GetName()}"] = np.array(names, "S")
-    ids = _numpy(data.GetPointData().GetGlobalIds())
-    return arrays if ids is None else {**arrays, "global": ids}
-
-
-def _numpy(array: Any) -> Any:
-    from vtkmodules.util.numpy_support import vtk_to_numpy
-
-    return None if array is None else vtk_to_numpy(array)
 
 
 if __name__ == "__main__":

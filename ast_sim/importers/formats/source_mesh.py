@@ -83,6 +83,7 @@ class SourceMesh:
         same_point: [n] int64, the numbers that the file gives its points: points with the same number are one point.
             None if it gives none.
         pieces: [n] int64, the piece of the file that each point belongs to; None if there is one.
+        piece_names: the names of the pieces, "" for one without a name.
     """
 
     path: Path
@@ -96,6 +97,7 @@ class SourceMesh:
     columns: dict[str, tuple[str, ...]] = field(default_factory=dict)
     same_point: np.ndarray | None = None
     pieces: np.ndarray | None = None
+    piece_names: tuple[str, ...] = ()
 
     def require_consistent(self) -> None:
         """Check that cells refer to points that there are, that these are finite, and that each field has a row for

@@ -45,8 +45,19 @@ def together(meshes: Sequence[SourceMesh]) -> SourceMesh:
         meshes[0].time,
         {name: columns for mesh in meshes for name, columns in mesh.columns.items()},
         np.concatenate(with_ids) if len(with_ids) == len(meshes) else None,
-        np.repeat(np.arange(len(meshes)), np.diff(starts)),
+        *_pieces(meshes),
     )
+
+
+def _pieces(meshes: Sequence[SourceMesh]) -> tuple[np.ndarray, tuple[str, ...]]:
+    """The piece of each point, and the names of the pieces; a mesh that has no pieces is one."""
+    pieces: list[np.ndarray] = []
+    names: list[str] = []
+    for mesh in meshes:
+        own = np.zeros(len(mesh.points), np.int64) if mesh.pieces is None else mesh.pieces
+        pieces.append(len(names) + own)
+        names += mesh.piece_names or [""] * int(own.max(initial=0) + 1)
+    return np.concatenate(pieces), tuple(names)
 
 
 def _filled(parts: list[tuple[dict[str, np.ndarray], int]]) -> tuple[dict[str, np.ndarray], list[str]]:

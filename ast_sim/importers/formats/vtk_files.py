@@ -18,6 +18,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 
@@ -138,7 +139,7 @@ def _of_pieces(path: Path) -> tuple[list[tuple[int, int]], int]:
     """As `_checked`, of a file that lists the files of its pieces or blocks."""
     listed = declared_in_xml(path).sources
     if path.suffix.lower() in (".vtm", ".vtmb"):
-        listed = re.findall(r'\bfile="([^"]+)"', path.read_text(errors="replace"))
+        listed = [entry.attrib["file"] for entry in ElementTree.parse(path).iter("DataSet") if entry.get("file")]
     pieces, budget = [], _OWN_BYTES
     for name in listed:
         file = path.parent / name
@@ -267,6 +268,7 @@ def _part(path: Path, part: dict[str, np.ndarray], time: float | None) -> Source
         time=time,
         columns={n: tuple(one.decode(errors="replace") for one in v.tolist()) for n, v in names.items()},
         same_point=part["global"].astype(np.int64) if "global" in part else None,
+        piece_names=(part["block"].item().decode(errors="replace"),),
     )
 
 
@@ -278,7 +280,7 @@ def _with_pieces(mesh: SourceMesh, pieces: list[tuple[int, int]]) -> SourceMesh:
     """VTK has joined the pieces of a file in their order; their sizes say which point belongs to which."""
     if mesh.pieces is not None or sum(count > 0 for count, _ in pieces) < 2:
         return mesh
-    return replace(mesh, pieces=np.repeat(np.arange(len(pieces)), [count for count, _ in pieces]))
+    return replace(mesh, pieces=np.repeat(np.arange(len(pieces)), [count for count, _ in pieces]), piece_names=())
 
 
 def _without_ghosts(mesh: SourceMesh) -> SourceMesh:

@@ -146,6 +146,8 @@ def _prescribe(
         return
     lowest = whole(first, line)
     highest = whole(last, line) if last else lowest
+    if not 1 <= lowest <= highest:
+        raise DatasetError(f"{line.place}: holds the directions {lowest} to {highest}; the first is 1")
     for direction in range(lowest, min(highest, _DIRECTIONS) + 1):
         state.now[rows, direction - 1] = True
     if lowest <= 3 and real(value, line) != 0:

@@ -13,16 +13,28 @@ from ast_sim.importers.decks.keyword_lines import Keyword
 from ast_sim.material import ELASTIC, YIELD_STRESS
 
 MATERIAL_KEYWORDS = ("MATERIAL", "ELASTIC", "PLASTIC", "SOLIDSECTION", "DENSITY")
+
+# With these beside *ELASTIC and *PLASTIC, the material has another law.
+_OTHER_LAWS = {
+    *("CREEP", "VISCOELASTIC", "VISCOUS", "HYPERELASTIC", "HYPERFOAM", "HYPOELASTIC", "MULLINSEFFECT", "USERMATERIAL"),
+    *("DEFORMATIONPLASTICITY", "CAPPLASTICITY", "CASTIRONPLASTICITY", "CLAYPLASTICITY", "CRUSHABLEFOAM", "CONCRETE"),
+    *("CONCRETEDAMAGEDPLASTICITY", "DRUCKERPRAGER", "MOHRCOULOMB", "MOHRCOULOMBPLASTICITY", "MODIFIEDMOHRCOULOMB"),
+    *("POROUSELASTIC", "POROUSMETALPLASTICITY", "DAMAGEINITIATION", "BRITTLECRACKING", "NOCOMPRESSION", "NOTENSION"),
+    *("POTENTIAL", "CYCLICHARDENING", "RATEDEPENDENT", "SWELLING", "SUPERELASTIC", "CHANGEPLASTIC", "JOINTEDMATERIAL"),
+}
+
 COLUMNS = (*ELASTIC, YIELD_STRESS)  # each an attribute of `_Material`
 
 
 @dataclass(eq=False)
 class _Material:
-    """Young's modulus, Poisson's ratio and the first yield stress, 0 if it never yields; NaN: not isotropic elastic."""
+    """Young's modulus, Poisson's ratio and the first yield stress, 0 if it never yields; NaN: not isotropic elastic.
+    `other_law`: the material has another law."""
 
     young: float = np.nan
     poisson: float = np.nan
     yield_stress: float = 0.0
+    other_law: bool = False
 
 
 def material_columns(deck: Deck) -> tuple[dict[str, list[np.ndarray]], list[str]]:
@@ -46,7 +58,7 @@ def material_columns(deck: Deck) -> tuple[dict[str, list[np.ndarray]], list[str]
             for block, table in zip(blocks, tables, strict=True):
                 here = np.isin(block.numbers, numbers)
                 for column in COLUMNS:
-                    table[column][here] = getattr(one, column)
+                    table[column][here] = np.nan if one.other_law else getattr(one, column)
     lacking = sum(int(np.isnan(list(table.values())).any(axis=0).sum()) for table in tables)
     if lacking:
         return {}, [*notes, f"{lacking} elements have no isotropic *ELASTIC: no material is taken"]
@@ -70,9 +82,14 @@ def _materials(deck: Deck) -> tuple[dict[str, _Material], list[str]]:
                 refuse_decimal_commas(keyword.data[0], 2, "Young's modulus and a Poisson's ratio of 0")
             if len(keyword.data) > 1:
                 notes.append("*ELASTIC depends on the temperature: its first line is taken")
+        elif keyword.name in _OTHER_LAWS:
+            current.other_law = True
+            notes.append(f"the material of line {keyword.line.number} has *{keyword.name}")
         elif keyword.name == "PLASTIC":
             (current.yield_stress,) = _first(keyword, 1)
             _require_no_strain(keyword)
+            if any(len(tokens(line)) > 2 for line in keyword.data):
+                notes.append("*PLASTIC depends on the temperature: its first line is taken")
     return materials, notes
 
 

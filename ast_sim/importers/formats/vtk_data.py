@@ -1,0 +1,106 @@
+"""What a data set of VTK holds: its meshes, their names, their arrays and its time. Only the process that reads files
+loads VTK."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+
+class Refused(Exception):
+    """VTK cannot read a file. The text says why."""
+
+
+class Part(NamedTuple):
+    """A mesh of a data set; the names of its blocks, joined by slashes; its own name if it is a set of nodes of
+    Exodus."""
+
+    data: Any
+    name: str = ""
+    of_set: str = ""
+
+
+def parts_of(data: Any, names: tuple[str, ...] = ()) -> list[Part]:
+    """The meshes of a data set, one for each block that is there."""
+    from vtkmodules.vtkCommonDataModel import vtkCompositeDataSet, vtkDataSet, vtkMultiBlockDataSet
+
+    if isinstance(data, vtkDataSet):
+        return [Part(data, "/".join(names), names[-1] if "Node Sets" in names[:-1] else "")]
+    if not isinstance(data, vtkCompositeDataSet):
+        raise Refused(f"holds a {data.GetClassName().removeprefix('vtk') if data is not None else 'nothing'}, no mesh")
+    parts = []
+    if isinstance(data, vtkMultiBlockDataSet):
+        for index in range(data.GetNumberOfBlocks()):
+            block = data.GetBlock(index)
+            facts = data.GetMetaData(index) if data.HasMetaData(index) else None
+            label = (facts.Get(vtkCompositeDataSet.NAME()) if facts is not None else None) or ""
+            if block is not None:
+                parts += parts_of(block, (*names, label))
+        return parts
+    iterator = data.NewIterator()
+    while not iterator.IsDoneWithTraversal():
+        parts += parts_of(iterator.GetCurrentDataObject(), names)
+        iterator.GoToNextItem()
+    return parts
+
+
+def time_of(data: Any, parts: Sequence[Part] = ()) -> float | None:
+    """The time that a data set says, or else the one time that its meshes say; None if they say none or several."""
+    times = [_own_time(data), *({_own_time(part.data) for part in parts} - {None})]
+    return times[0] if times[0] is not None else times[1] if len(times) == 2 else None
+
+
+def _own_time(data: Any) -> float | None:
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    facts = data.GetFieldData()
+    arrays = [facts.GetArray(index) for index in range(facts.GetNumberOfArrays())] if facts is not None else []
+    named = {(array.GetName() or "").lower(): array for array in arrays if array is not None}  # None: a text
+    for name in ("timevalue", "time_value", "time"):
+        if name in named and named[name].GetNumberOfValues() == 1:
+            return float(vtk_to_numpy(named[name]).ravel()[0])
+    return None
+
+
+def arrays_of(part: Part) -> dict[str, np.ndarray]:
+    """The arrays of a mesh by name; see `reading_worker`."""
+    from vtkmodules.vtkCommonDataModel import vtkUnstructuredGrid
+    from vtkmodules.vtkFiltersCore import vtkAppendFilter
+
+    data = part.data
+    if part.of_set:
+        ids = _numpy(data.GetPointData().GetGlobalIds())
+        return {} if ids is None else {f"group {part.of_set}": ids}
+    if not isinstance(data, vtkUnstructuredGrid):
+        append = vtkAppendFilter()
+        append.AddInputData(data)
+        append.Update()
+        data = append.GetOutput()
+    arrays = {"points": np.zeros((0, 3)), "types": np.zeros(0, np.uint8), "connectivity": np.zeros(0, np.int64)}
+    arrays["offsets"] = np.zeros(1, np.int64)
+    arrays["block"] = np.array([part.name.encode(errors="replace")])
+    if data.GetNumberOfPoints():
+        arrays["points"] = _numpy(data.GetPoints().GetData())
+    if data.GetNumberOfCells():
+        cells = data.GetCells()
+        arrays["types"] = _numpy(data.GetCellTypes())
+        arrays["offsets"] = _numpy(cells.GetOffsetsArray()).astype(np.int64)
+        arrays["connectivity"] = _numpy(cells.GetConnectivityArray()).astype(np.int64)
+    for place, fields in (("point", data.GetPointData()), ("cell", data.GetCellData())):
+        for index in range(fields.GetNumberOfArrays()):
+            array = fields.GetArray(index)  # None for text
+            if array is not None and array.GetName():
+                arrays[f"{place} {array.GetName()}"] = _numpy(array)
+                names = [array.GetComponentName(c) or "" for c in range(array.GetNumberOfComponents())]
+                if any(names):
+                    arrays[f"{place}-columns {array.GetName()}"] = np.array(names, "S")
+    ids = _numpy(data.GetPointData().GetGlobalIds())
+    return arrays if ids is None else {**arrays, "global": ids}
+
+
+def _numpy(array: Any) -> Any:
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    return None if array is None else vtk_to_numpy(array)
