@@ -20,7 +20,8 @@ SERIES = ".series"
 _NUMBER = re.compile(r"([0-9]+(?:\.[0-9]+)?(?:[eE][-+]?[0-9]+)?)")
 
 
-Part = tuple[str, float, str]
+FilePart = tuple[str, float, str]
+_Frames = dict[float, list[tuple[FilePart, Path]]]  # by time
 
 
 class FrameFiles(NamedTuple):
@@ -136,7 +137,7 @@ def _collection(source: Path) -> FrameFiles:
     times = [time for time, _, _ in entries]
     if len(entries) > 1 and not np.isfinite(times).all():
         raise DatasetError(f"{source}: every frame needs a timestep")
-    frames: dict[float, list[tuple[Part, Path]]] = {}
+    frames: _Frames = {}
     for time, part, name in sorted(entries, key=lambda one: one[0]):
         frames.setdefault(time, []).append((part, _listed(source, name)))
     counts = {len(files) for files in frames.values()}
@@ -148,12 +149,14 @@ def _collection(source: Path) -> FrameFiles:
     return FrameFiles(ordered_files, list(frames) if len(frames) > 1 else None)
 
 
-def _part(entry: ElementTree.Element) -> Part:
+def _part(entry: ElementTree.Element) -> FilePart:
     """What a PVD file says of a part of a frame: its group, its number and its name."""
     return entry.get("group", ""), float(entry.get("part", "0")), entry.get("name", "")
 
 
-def _parts_in_order(source: Path, frames: dict[float, list[tuple[Part, Path]]]) -> dict[float, list[tuple[Part, Path]]]:
+def _parts_in_order(
+    source: Path, frames: dict[float, list[tuple[FilePart, Path]]]
+) -> dict[float, list[tuple[FilePart, Path]]]:
     """The files of each frame in the order of their parts. If the PVD file does not tell the parts apart, the names of
     the files without their numbers do, if they can."""
     if all(len({part for part, _ in files}) == len(files) for files in frames.values()):

@@ -36,8 +36,8 @@ def composed(*given: Tensor | None) -> Tensor:
 @pytest.mark.parametrize("rotated", [True, False])
 @pytest.mark.parametrize("sizes", [([1], [1]), ([130, 0, 5], [7, 9, 300]), ([3, 4], [0, 5])])
 def test_accuracy(sizes, rotated, monkeypatch):
-    """Of the vectors and of all gradients but those of the rotations, which no kernel has; with and without the inputs
-    of GEGLU kept between."""
+    """The vectors and all gradients but of rotations, for which there is no kernel; with and without the inputs of
+    GEGLU kept between."""
     x, context, *turns, q_offsets, k_offsets, _ = (inputs := case(*sizes, 40, 24, rotated))[:7]
 
     def turned(function):

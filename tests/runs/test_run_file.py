@@ -133,8 +133,8 @@ def test_no_damage_is_silent(saved, tmp_path):
         ({"LICENSE": b"MIT"}, "LICENSE is damaged: it differs from the manifest"),
         ({"manifest.json": b"[]"}, "manifest.json is damaged"),
         (
-            {"manifest.json": b'{"format": "ast_sim run", "version": 2, "files": {}}'},
-            "'ast_sim run' 2, not 'ast_sim run' 1",
+            {"manifest.json": b'{"format": "ast_sim run", "version": 3, "files": {}}'},
+            "'ast_sim run' 3, not 'ast_sim run' 2",
         ),
     ],
 )

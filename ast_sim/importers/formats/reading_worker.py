@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 
 from ast_sim.importers.formats.frd_results import partly_given, read_frd_headers
-from ast_sim.importers.formats.vtk_data import Part, Refused, arrays_of, parts_of, time_of
+from ast_sim.importers.formats.vtk_data import Block, Refused, arrays_of, parts_of, time_of
 
 _ENDINGS_OF_EXODUS = {".e", ".ex2", ".exo", ".exoii", ".exii", ".g", ".gen"}
 
@@ -146,7 +146,7 @@ class _Results:
     def frame(self, step: int) -> dict[str, np.ndarray]:
         if self.times[step] is not None:
             self.reader.set_active_time_point(step)
-        arrays = arrays_of(Part(self.reader.read()))
+        arrays = arrays_of(Block(self.reader.read()))
         arrays["global"] = arrays.pop("point original_node_ids")
         for result, nodes in self.partial.get(self.times[step] or 0.0, []):
             for name in arrays:  # also STRESS_Mises, which the reader computes; it fills with zeros

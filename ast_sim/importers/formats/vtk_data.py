@@ -13,7 +13,7 @@ class Refused(Exception):
     """VTK cannot read a file. The text says why."""
 
 
-class Part(NamedTuple):
+class Block(NamedTuple):
     """A mesh of a data set; the names of its blocks, joined by slashes; its own name if it is a set of nodes of
     Exodus."""
 
@@ -22,12 +22,12 @@ class Part(NamedTuple):
     of_set: str = ""
 
 
-def parts_of(data: Any, names: tuple[str, ...] = ()) -> list[Part]:
+def parts_of(data: Any, names: tuple[str, ...] = ()) -> list[Block]:
     """The meshes of a data set, one for each block that is there."""
     from vtkmodules.vtkCommonDataModel import vtkCompositeDataSet, vtkDataSet, vtkMultiBlockDataSet
 
     if isinstance(data, vtkDataSet):
-        return [Part(data, "/".join(names), names[-1] if "Node Sets" in names[:-1] else "")]
+        return [Block(data, "/".join(names), names[-1] if "Node Sets" in names[:-1] else "")]
     if not isinstance(data, vtkCompositeDataSet):
         raise Refused(f"holds a {data.GetClassName().removeprefix('vtk') if data is not None else 'nothing'}, no mesh")
     parts = []
@@ -46,7 +46,7 @@ def parts_of(data: Any, names: tuple[str, ...] = ()) -> list[Part]:
     return parts
 
 
-def time_of(data: Any, parts: Sequence[Part] = ()) -> float | None:
+def time_of(data: Any, parts: Sequence[Block] = ()) -> float | None:
     """The time that a data set says, or else the one time that its meshes say; None if they say none or several."""
     times = [_own_time(data), *({_own_time(part.data) for part in parts} - {None})]
     return times[0] if times[0] is not None else times[1] if len(times) == 2 else None
@@ -64,7 +64,7 @@ def _own_time(data: Any) -> float | None:
     return None
 
 
-def arrays_of(part: Part) -> dict[str, np.ndarray]:
+def arrays_of(part: Block) -> dict[str, np.ndarray]:
     """The arrays of a mesh by name; see `reading_worker`."""
     from vtkmodules.vtkCommonDataModel import vtkUnstructuredGrid
     from vtkmodules.vtkFiltersCore import vtkAppendFilter

@@ -70,11 +70,10 @@ def checked_recipe(
         raise ConfigError(f"order is {order}; must be 2 (tetrahedra of ten nodes) or 1 (of four nodes)")
     order = None if order == 1 else order
     fewest = module.MINIMUM_NODES if order is None else module.SECOND_ORDER_NODES
-    for name, value, minimum in (("seed", seed, 0), ("nodes", nodes, fewest)):
-        if value is None or value < minimum:
-            raise ConfigError(f"{name} is {value}; must be at least {minimum}")
-    if seed > LARGEST_SEED:
-        raise ConfigError(f"seed is {seed}; must be at most 2^63 - 1, the largest number that the file can hold")
+    if seed is None or not 0 <= seed <= LARGEST_SEED:
+        raise ConfigError(f"seed is {seed}; must be from 0 to 2^63 - 1, the largest number that the file can hold")
+    if nodes is not None and nodes < fewest:
+        raise ConfigError(f"nodes is {nodes}; must be at least {fewest}")
     yielding = () if spec is None else read_spec(spec).yielding
     solver = solver or ("calculix" if yielding else "own")
     if solver == "own" and yielding:
