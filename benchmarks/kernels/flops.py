@@ -73,6 +73,24 @@ def _self_attention_backward(*inputs, **_) -> int:
     return _self_attention(*inputs) * 5 // 2
 
 
+def _block_parts(x: Tensor, context: Tensor, rotations, context_rotations, *rest) -> tuple[int, int]:
+    """Of the dense layers, and of attention."""
+    q_offsets, k_offsets, *parameters = rest
+    query, key_value, weight, first, second = (parameters[place] for place in (4, 5, 6, 10, 12))
+    of_layers = sum(_product(len(x), *layer.shape) for layer in (query, weight, first, second))
+    pairs = int((q_offsets.diff() * k_offsets.diff()).sum())
+    return of_layers + _product(len(context), *key_value.shape), 2 * _product(pairs, len(query))
+
+
+def _block(*inputs, **_) -> int:
+    return sum(_block_parts(*inputs))
+
+
+def _block_backward(dout: Tensor, *inputs, **_) -> int:
+    of_layers, of_attention = _block_parts(*inputs)
+    return 2 * of_layers + of_attention * 5 // 2
+
+
 def _sparse_conv(x: Tensor, weight: Tensor, bias, transposed, pair_offsets: Tensor, *_, **__) -> int:
     return _product(int(pair_offsets[-1]), *weight.shape[1:])
 
@@ -102,6 +120,8 @@ FORMULAS = {
     ops.attention_kv_backward: _raw(_cross_attention_backward),
     ops.attention_qkv: _raw(_self_attention),
     ops.attention_qkv_backward: _raw(_self_attention_backward),
+    ops.attention_block: _raw(_block),
+    ops.attention_block_backward: _raw(_block_backward),
     ops.sparse_conv: _raw(_sparse_conv),
     ops.sparse_conv_transposed: _raw(_sparse_conv),
     ops.sparse_conv_weight: _raw(_sparse_conv_weight),

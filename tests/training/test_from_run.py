@@ -225,7 +225,7 @@ def test_options_win_over_a_file_and_a_file_over_the_preset(folder, tmp_path):
         ('[train]\nsteps = "many"\n', "train.steps is 'many'; must be an integer"),
         ('[model]\nname = "mgm"\n', "there is no model 'mgm'; did you mean 'mgn'"),
         ("[model]\nhidden = 0\n", "model.hidden is 0; it must be at least 1"),
-        ("version = 9\n", "has version 9, not 1"),
+        ("version = 9\n", "has version 9, not 2"),
         ("\udcff", "is not valid TOML"),
         (None, "cannot be read: No such file or directory"),
     ],

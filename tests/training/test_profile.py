@@ -52,7 +52,7 @@ def test_a_profiled_run_is_trained_as_if_it_had_not_been(tmp_path, capsys):
     data = toy.write(tmp_path / "toy.h5")
     settings = ["--set", "train.steps=4", "--set", "train.validate_every=4"]
     assert main(["train", str(data), "--out", str(tmp_path / "a"), *settings, "--profile", "2"]) == 0
-    assert "attention_kv_backward" in capsys.readouterr().out
+    assert "attention_block_backward" in capsys.readouterr().out
     assert checkpoint.latest(tmp_path / "a") is None
     assert main(["train", "--out", str(tmp_path / "a"), "--resume"]) == 0
     train.start_training(tmp_path / "b", train.configure(data, "tiny", settings[1::2]))
