@@ -277,6 +277,7 @@ def test_nodes_of_some_steps_only_and_a_job_that_stopped(press, tmp_path):
 
 
 def test_results_without_displacements_and_other_files(bodies, press, tmp_path):
+    (tmp_path / "a.vtu").touch()
     with pytest.raises(AstSimError, match="beside a deck, results must be a file of CalculiX"):
         convert(tmp_path / "a.vtu", tmp_path / "d.h5", deck=press[0])
     lines = [line for line in deck(*bodies, step(-0.02)) if line not in ("*NODE FILE", "U")]
