@@ -1,5 +1,7 @@
 """Is an answer physics? On a frame of the solver, and on frames that are wrong in a known way."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from solids import blocks, pressed
@@ -15,11 +17,9 @@ def squeezed():
     case = pressed(*blocks(), depth=0.01, frames=1)
     found = solve_frame(case, 1)
     assert found.failure == ""
-    return case.scene, found.position.astype(np.float32), law_of(case.material.young, case.material.poisson)
-
-
-def law_of(young: float, poisson: float) -> Law:
-    return Law(Material((), {"young": young, "poisson": poisson, "friction": 0.0}), 1e-3)
+    columns = np.broadcast_arrays(np.zeros(case.scene.num_elements), case.material.young, case.material.poisson)[1:]
+    scene = replace(case.scene, material=np.stack(columns, axis=1).astype(np.float32))
+    return scene, found.position.astype(np.float32), Law(Material(("young", "poisson"), {"friction": 0.0}), 1e-3)
 
 
 def values(*arguments) -> list:
@@ -66,6 +66,7 @@ def test_what_is_not_known_is_said(squeezed):
     scene, position, law = squeezed
     found = check_physics(scene, position[None], [1], None, "m")
     assert found.residual.value is None and "law of the material is not known" in found.residual.sentence
-    wrong = check_physics(scene, position[None], [1], law_of(1e6, 0.5), "m")
+    incompressible = replace(scene, material=np.full_like(scene.material, 0.5))
+    wrong = check_physics(incompressible, position[None], [1], law, "m")
     assert wrong.imbalance.value is None and "Poisson" in wrong.imbalance.sentence
     assert check_physics(scene, position[:0, None], [], law, "m").depth.sentence == "no frame was predicted"
