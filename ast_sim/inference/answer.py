@@ -265,7 +265,7 @@ class Answer:
             quantity: "displacement": of all free nodes, in the unit of length; "reaction": of the force on `driven`, in
                 newton; "stress": of the largest stress, in pascal.
         """
-        require_quantity(quantity)
+        require_quantity(quantity, self.bands)
         return self.bands[quantity].around(self, quantity) if quantity in self.bands else None
 
     def errors(self, truth: Trajectory) -> dict[str, float]:

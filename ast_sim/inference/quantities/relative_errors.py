@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import math
+from collections.abc import Container
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -115,9 +116,9 @@ def require_same_motion(answer: Answer, truth: Trajectory | None) -> None:
         _require_same_frame(answer, len(answer.frames) - 1, truth.select([answer.frames[-1]]))
 
 
-def require_quantity(quantity: str) -> None:
-    """Raise ConfigError unless an error or a band of this quantity may be known."""
-    if quantity not in QUANTITIES:
+def require_quantity(quantity: str, more: Container[str] = ()) -> None:
+    """Raise ConfigError unless a band of this quantity may be known, or it is one of `more`."""
+    if quantity not in QUANTITIES and quantity not in more:
         raise ConfigError(f"a band of {quantity!r} is not known; known are {', '.join(QUANTITIES)}")
 
 
