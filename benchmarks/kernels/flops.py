@@ -48,9 +48,14 @@ def _message_backward(dsum, dmessages, *inputs, **_) -> int:
     return 2 * _message(*inputs) - of_edges
 
 
-def _attention(q: Tensor, k: Tensor, v: Tensor, q_offsets: Tensor, k_offsets: Tensor, *_, **__) -> int:
+def _of_pairs(q_offsets: Tensor, k_offsets: Tensor, *width: int) -> int:
+    """Scores of all pairs of a query and a key of one scene, and sums of as many values."""
     pairs = int((q_offsets.diff() * k_offsets.diff()).sum())
-    return 2 * _product(pairs, *q.shape[1:])
+    return 2 * _product(pairs, *width)
+
+
+def _attention(q: Tensor, k: Tensor, v: Tensor, q_offsets: Tensor, k_offsets: Tensor, *_, **__) -> int:
+    return _of_pairs(q_offsets, k_offsets, *q.shape[1:])
 
 
 def _attention_backward(*inputs, **_) -> int:
@@ -78,8 +83,8 @@ def _block_parts(x: Tensor, context: Tensor, rotations, context_rotations, *rest
     q_offsets, k_offsets, *parameters = rest
     query, key_value, weight, first, second = (parameters[place] for place in (4, 5, 6, 10, 12))
     of_layers = sum(_product(len(x), *layer.shape) for layer in (query, weight, first, second))
-    pairs = int((q_offsets.diff() * k_offsets.diff()).sum())
-    return of_layers + _product(len(context), *key_value.shape), 2 * _product(pairs, len(query))
+    of_layers += _product(len(context), *key_value.shape)
+    return of_layers, _of_pairs(q_offsets, k_offsets, len(query))
 
 
 def _block(*inputs, **_) -> int:

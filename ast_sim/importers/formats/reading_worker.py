@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 
 from ast_sim.importers.formats.frd_results import partly_given, read_frd_headers
-from ast_sim.importers.formats.vtk_data import Block, Refused, arrays_of, parts_of, time_of
+from ast_sim.importers.formats.vtk_data import Block, Refused, arrays_of, blocks_of, time_of
 
 _ENDINGS_OF_EXODUS = {".e", ".ex2", ".exo", ".exoii", ".exii", ".g", ".gen"}
 
@@ -119,9 +119,9 @@ def _read(path: Path, step: int) -> tuple[dict[str, Any], list[dict[str, np.ndar
         file.set_step(step)  # by its number: times may stand in a file twice
     file.reader.Update()
     data = file.reader.GetOutputDataObject(0)
-    parts = parts_of(data)
-    time = time_of(data, parts) if file.set_step is None else file.times[step]
-    return {"steps": len(file.times), "time": time, **file.facts}, [arrays_of(part) for part in parts]
+    blocks = blocks_of(data)
+    time = time_of(data, blocks) if file.set_step is None else file.times[step]
+    return {"steps": len(file.times), "time": time, **file.facts}, [arrays_of(block) for block in blocks]
 
 
 @dataclass

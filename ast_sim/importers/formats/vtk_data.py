@@ -22,7 +22,7 @@ class Block(NamedTuple):
     of_set: str = ""
 
 
-def parts_of(data: Any, names: tuple[str, ...] = ()) -> list[Block]:
+def blocks_of(data: Any, names: tuple[str, ...] = ()) -> list[Block]:
     """The meshes of a data set, one for each block that is there."""
     from vtkmodules.vtkCommonDataModel import vtkCompositeDataSet, vtkDataSet, vtkMultiBlockDataSet
 
@@ -30,25 +30,25 @@ def parts_of(data: Any, names: tuple[str, ...] = ()) -> list[Block]:
         return [Block(data, "/".join(names), names[-1] if "Node Sets" in names[:-1] else "")]
     if not isinstance(data, vtkCompositeDataSet):
         raise Refused(f"holds a {data.GetClassName().removeprefix('vtk') if data is not None else 'nothing'}, no mesh")
-    parts = []
+    blocks = []
     if isinstance(data, vtkMultiBlockDataSet):
         for index in range(data.GetNumberOfBlocks()):
-            block = data.GetBlock(index)
+            held = data.GetBlock(index)
             facts = data.GetMetaData(index) if data.HasMetaData(index) else None
             label = (facts.Get(vtkCompositeDataSet.NAME()) if facts is not None else None) or ""
-            if block is not None:
-                parts += parts_of(block, (*names, label))
-        return parts
+            if held is not None:
+                blocks += blocks_of(held, (*names, label))
+        return blocks
     iterator = data.NewIterator()
     while not iterator.IsDoneWithTraversal():
-        parts += parts_of(iterator.GetCurrentDataObject(), names)
+        blocks += blocks_of(iterator.GetCurrentDataObject(), names)
         iterator.GoToNextItem()
-    return parts
+    return blocks
 
 
-def time_of(data: Any, parts: Sequence[Block] = ()) -> float | None:
+def time_of(data: Any, blocks: Sequence[Block] = ()) -> float | None:
     """The time that a data set says, or else the one time that its meshes say; None if they say none or several."""
-    times = [_own_time(data), *({_own_time(part.data) for part in parts} - {None})]
+    times = [_own_time(data), *({_own_time(block.data) for block in blocks} - {None})]
     return times[0] if times[0] is not None else times[1] if len(times) == 2 else None
 
 
@@ -64,15 +64,15 @@ def _own_time(data: Any) -> float | None:
     return None
 
 
-def arrays_of(part: Block) -> dict[str, np.ndarray]:
+def arrays_of(block: Block) -> dict[str, np.ndarray]:
     """The arrays of a mesh by name; see `reading_worker`."""
     from vtkmodules.vtkCommonDataModel import vtkUnstructuredGrid
     from vtkmodules.vtkFiltersCore import vtkAppendFilter
 
-    data = part.data
-    if part.of_set:
+    data = block.data
+    if block.of_set:
         ids = _numpy(data.GetPointData().GetGlobalIds())
-        return {} if ids is None else {f"group {part.of_set}": ids}
+        return {} if ids is None else {f"group {block.of_set}": ids}
     if not isinstance(data, vtkUnstructuredGrid):
         append = vtkAppendFilter()
         append.AddInputData(data)
@@ -80,7 +80,7 @@ def arrays_of(part: Block) -> dict[str, np.ndarray]:
         data = append.GetOutput()
     arrays = {"points": np.zeros((0, 3)), "types": np.zeros(0, np.uint8), "connectivity": np.zeros(0, np.int64)}
     arrays["offsets"] = np.zeros(1, np.int64)
-    arrays["block"] = np.array([part.name.encode(errors="replace")])
+    arrays["block"] = np.array([block.name.encode(errors="replace")])
     if data.GetNumberOfPoints():
         arrays["points"] = _numpy(data.GetPoints().GetData())
     if data.GetNumberOfCells():
