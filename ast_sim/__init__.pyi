@@ -4,6 +4,7 @@ from .dataset.reader import Dataset as Dataset
 from .dataset.writer import DatasetWriter as DatasetWriter
 from .importers.convert import convert as convert
 from .importers.scene_mesh import read_scene as read_scene
+from .importers.series import FieldNames as FieldNames
 from .inference.answer import Answer as Answer
 from .inference.effort import Effort as Effort
 from .inference.evaluation.evaluated_run import Evaluation as Evaluation

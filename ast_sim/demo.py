@@ -29,7 +29,6 @@ from ast_sim.view import export, picture, report
 FAMILY = "deforming_plate"
 NODES, FRAMES = 400, 41  # fewer than the family's defaults, so that the demonstration takes minutes
 KEPT = (14, 24, 34)  # of a training scene: many scenes of few frames teach more than few scenes of all frames
-SOLVER_SCENES = 3  # test scenes in which the solver solves the deepest frame, too
 
 
 @dataclass(frozen=True)
@@ -73,7 +72,7 @@ def demo(out: Path, quick: bool = False, seed: int = 0) -> Figures:
 
     _announce(3, f"predicting the {size.test} plates that the model has not seen")
     command = shlex.join(["ast-sim", "demo", "--out", str(out), *(["--quick"] if quick else []), "--seed", str(seed)])
-    evaluation = run.evaluate(unseen, command=command, solver_scenes=SOLVER_SCENES)
+    evaluation = run.evaluate(unseen, command=command)
     evaluation.save(out / "evaluation.json")
     _announce(4, "writing the report")
     _write_pages(evaluation, out)

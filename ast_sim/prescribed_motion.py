@@ -305,8 +305,9 @@ def _moved(scene: Scene, motions: Mapping[int, RigidMotion | Vector]) -> Iterato
         nodes = nodes_of_body(scene.body, body) & scene.prescribed
         if not nodes.any():
             raise ConfigError(
-                f"body {body} has no prescribed node that could be moved; mark the body with --obstacle {body} or nodes"
-                f" of it with --clamp {body}:PLACE"
+                f"body {body} has no prescribed node that could be moved; mark the body with"
+                f" obstacles=[{body}] (--obstacle {body}) or nodes of it with clamps=['{body}:PLACE']"
+                f" (--clamp {body}:PLACE)"
             )
         yield nodes, motion if isinstance(motion, RigidMotion) else RigidMotion(motion)
 

@@ -1,10 +1,11 @@
-"""What every test shares: the debug mode of the binding is on, few threads are used, and long tests come first."""
+"""What every test shares: the debug mode of the binding is on, a test has one thread, and long tests come first."""
 
 import os
 from pathlib import Path
 
 os.environ.setdefault("AST_SIM_DEBUG", "1")
-os.environ.setdefault("OMP_NUM_THREADS", "2")
+# Small scenes gain nothing from threads, and lose where tests run side by side. Tests of threads set their own number.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # a thread that waits leaves its core to the other tests
 
 # Files with a test or fixture of more than about 15 s: first, so that in the end no process waits for another's test.

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 import toy
 from data_samples import sign
-from toy import one_thread  # noqa: F401 (used by being imported)
 
 from ast_sim.cli import build_parser, main
 from ast_sim.dataset.reader import Dataset

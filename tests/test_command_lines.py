@@ -18,7 +18,6 @@ import pytest
 import toy
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from toy import one_thread  # noqa: F401 (used by being imported)
 
 import ast_sim
 from ast_sim import demo

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import pytest
 from chosen_figures import NO_DEEPEST, evaluation
-from toy import one_thread  # noqa: F401 (used by being imported)
 
 from ast_sim import demo
 from ast_sim.cli import main

@@ -183,6 +183,33 @@ def test_unclear_words_are_seen():
         assert not UNCLEAR.search(text), text
 
 
+def advice_for_one_caller(source: str) -> list[str]:
+    """Texts of errors with an option of the command line, such as --resume, but no argument, such as resume=True. Whole
+    commands are advice for both callers."""
+    raised = (node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Raise))
+    texts = (
+        "".join(part.value for part in ast.walk(node) if isinstance(part, ast.Constant) and isinstance(part.value, str))
+        for node in raised
+    )
+    return [text for text in texts if re.search(r"(?<![\w-])--[a-z]", text) and not re.search(r"ast-sim |\w=", text)]
+
+
+def test_advice_for_one_caller_is_seen():
+    source = "def f():\n    raise E(f'{a}: go on with {b} --resume')\n"
+    assert advice_for_one_caller(source) == [": go on with  --resume"]
+    assert not advice_for_one_caller(source.replace("--resume", "resume=True (--resume)"))
+    assert not advice_for_one_caller(source.replace("--resume", "ast-sim train --resume"))
+
+
+@pytest.mark.parametrize(
+    "path",
+    [path for path in MODULE_FILES if path.parent.name != "command_line" and path.name not in ("cli.py", "demo.py")],
+    ids=lambda path: str(path.relative_to(ROOT)),
+)
+def test_errors_advise_callers_of_python_too(path):
+    assert not advice_for_one_caller(path.read_text())
+
+
 def test_texts_name_the_noun():
     """The log keeps the words of its time."""
     folders = [REPOSITORY / name for name in ("ast_sim", "benchmarks", "csrc", "docs", "examples", "tests")]

@@ -171,7 +171,9 @@ def test_what_is_wrong_is_named(make, message):
 
 def test_a_body_without_prescribed_nodes_and_positions_that_are_not_finite_are_named():
     free = two_tetrahedra(node_type=np.array([0, 0, 0, 0, NodeType.OBSTACLE], np.uint8))
-    with pytest.raises(ConfigError, match="body 0 has no prescribed node .*--obstacle 0 or .*--clamp 0:PLACE"):
+    with pytest.raises(
+        ConfigError, match="body 0 has no prescribed node .*obstacles=.0. .--obstacle 0. or .*--clamp 0:PLACE"
+    ):
         Motion.of_bodies(free, {0: (0, 0, 1)}, 3)
     position = np.zeros((3, 2, 3))
     position[2, 1, 0] = np.inf

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import toy
 from meshes import plate_and_punch
-from toy import one_thread  # noqa: F401 (used by being imported)
 
 import ast_sim
 from ast_sim import Effort, Material, Motion, Scene
@@ -141,6 +140,12 @@ def test_files_that_have_no_name(run, scene, data, answer, tmp_path):
                 refused(lambda take=take, value=value: take(value), f"{name} is {value!r}; it {NO_NAME}")
     refused(lambda: ast_sim.read_scene(5), "source is 5; it must be the name of a file or a mesh of meshio")
     refused(lambda: ast_sim.convert(tmp_path / "none", tmp_path / "c.h5"), "there is no such file or folder")
+    refused(
+        lambda: ast_sim.convert(data, tmp_path / "c.h5", shares=1), "there is no option shares; did you mean 'names'?"
+    )
+    refused(
+        lambda: ast_sim.convert(data, tmp_path / "c.h5", split=1), "there is no option split; did you mean 'splits'?"
+    )
     assert not os.listdir(tmp_path)
 
 
@@ -276,7 +281,10 @@ def test_arguments_of_long_work(data, run, tmp_path):
         (lambda: ast_sim.calibrate("run"), "a run is 'run'; it must be a Run"),
         (lambda: ast_sim.trade(5), "a run is 5; it must be a Run"),
         (lambda: ast_sim.trade(run, beside=run), "beside is of the type Run; it must be a list of runs"),
-        (lambda: run.evaluate(data, made_from="spec.toml"), "made_from is for the solver: give solver_scenes"),
+        (
+            lambda: run.evaluate(data, solver_scenes=0, made_from="spec.toml"),
+            "made_from is for the solver: give solver_scenes",
+        ),
         (lambda: run.expected_error(None), "effort is None; it must be an Effort"),
     ):
         refused(call, text)

@@ -5,11 +5,9 @@ A clamped plate bends under a block that presses and releases; positions are ana
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-import pytest
 import torch
 from meshes import box
 from torch import Tensor, nn
@@ -24,15 +22,6 @@ from ast_sim.models.ast.ast_config import ASTConfig
 from ast_sim.models.data_facts import DataFacts
 from ast_sim.models.simulator import Prediction, Simulator
 from ast_sim.scene import NodeType, Scene, Trajectory
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread() -> Iterator[None]:
-    """For the modules that import it: scenes this small gain nothing from threads, and lose on a busy machine."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 def plate(seed: int = 0, frames: int = 7, dynamic: bool = False, stress: bool = True) -> Trajectory:

@@ -35,11 +35,12 @@ def require_complete(source: Path, trajectory: Trajectory, names: FieldNames) ->
         unused = _unused(next(iter(frames(source))), names)
         named = ", ".join(f"{name} ({option})" for option, name in unused)
         options = " ".join(f"{option} {name}" for option, name in unused if "|" not in option)
+        arguments = ", ".join(f"{option[2:]}={name!r}" for option, name in unused if "|" not in option)
         advice = f"; these fields were not used: {named}" if unused else ""
-        advice += f"; try {options}" if options else ""
+        advice += f"; try {options}, in Python names=FieldNames({arguments})" if options else ""
         raise DatasetError(
             f"{source}: {' and '.join(missing)}{advice}; to predict a mesh with a trained run, use `ast-sim predict RUN"
-            " MESH --move BODY=X,Y,Z`; to convert as it is, give --incomplete"
+            " MESH --move BODY=X,Y,Z`; to convert as it is, give incomplete=True (--incomplete)"
         )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
@@ -22,7 +23,7 @@ from ast_sim.plausibility.findings import Finding, refusal, told
 from ast_sim.plausibility.motion import in_trajectory
 from ast_sim.scene import Trajectory
 from ast_sim.support.argument_checks import file_name, require_bool
-from ast_sim.support.errors import DatasetError, LooksWrong, nearest_name
+from ast_sim.support.errors import ConfigError, DatasetError, LooksWrong, nearest_name
 from ast_sim.support.progress import Progress, ShowProgress
 
 SHARES = {"train": 0.8, "valid": 0.1, "test": 0.1}
@@ -35,19 +36,27 @@ def convert(source: Path | str, out: Path | str, **options: Any) -> dict[str, in
     """Import simulations as a dataset: PVD, VTU and VTKHDF files, or a folder of a MeshGraphNets data set.
 
     Args:
-        options: the options of `convert_deepmind` if the source holds .tfrecord files, else of `convert_series`.
-            Both have `progress`, as in `generate`.
+        source, out: a file, or a folder of several; the dataset file, which is written whole or not at all.
+        options: `names` (an `ast_sim.FieldNames`), `splits`, `calibration`, `seed`, `integration`, `contact_radius`,
+            `time_step`, `length_unit`, `deck`, `corners`, `incomplete`, `strict` and `progress`, as in
+            `convert_series`. For a folder of .tfrecord files: `splits`, `limit`, `every` and `progress`, as in
+            `convert_deepmind`.
 
     Returns:
         The number of trajectories in each split.
 
     Raises:
+        ConfigError: there is no such option for this source.
         DatasetError: a file is wrong or something is missing in it; the text names the file. Nothing is written then.
     """
     if not (source := file_name(source, "source")).exists():
         raise DatasetError(f"{source}: there is no such file or folder")
     require_bool(**{key: options[key] for key in ("corners", "incomplete", "strict") if key in options})
     read = convert_deepmind if is_deepmind(source) else convert_series
+    known = [key for key in inspect.signature(read).parameters if key not in ("source", "out")]
+    unknown = next((key for key in options if key not in known), None)
+    if unknown is not None:
+        raise ConfigError(f"{source}: there is no option {unknown}{nearest_name(unknown, known)}")
     return read(source, file_name(out, "out"), **options)
 
 
@@ -213,8 +222,9 @@ def _assign(
     if splits is None and rest < len(SHARES):
         beside = f" beside {calibration} for calibration" if calibration else ""
         raise DatasetError(
-            f"{source}: the splits {', '.join(SHARES)} need three simulations{beside}, found: {len(names)}; say with"
-            " --shares where they go, for example --shares 1 0 0 to train on all or --shares 0 0 1 to test on all"
+            f"{source}: the splits {', '.join(SHARES)} need three simulations{beside}, found: {len(names)}; say"
+            " where they go, for example splits={'train': 1} (--shares 1 0 0) to train on all, or splits={'test': 1}"
+            " (--shares 0 0 1) to test on all"
         )
     splits = SHARES if splits is None else splits
     unknown = next((split for split in splits if split not in SPLITS), None)

@@ -35,7 +35,9 @@ def is_deepmind(source: Path) -> bool:
         DatasetError: the source is a single .tfrecord file.
     """
     if source.suffix == SUFFIX:
-        raise DatasetError(f"{source}: name its folder, which must hold {META} too; --split selects a single file")
+        raise DatasetError(
+            f"{source}: name its folder, which must hold {META} too; splits=[NAME] (--split NAME) selects a single file"
+        )
     return source.is_dir() and any(source.glob(f"*{SUFFIX}"))
 
 

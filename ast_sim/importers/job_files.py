@@ -48,8 +48,8 @@ def with_units(decks: Mapping[str, Path], names: FieldNames, length_unit: str | 
         raise ConfigError(f"there is no unit of stress {names.stress_unit!r}; known are {', '.join(STRESS_UNITS)}")
     if decks and (length_unit is None or names.stress_unit is None):
         raise ConfigError(
-            f"{next(iter(decks.values()))}: a deck does not say its units; give both, for example --length-unit mm"
-            " --stress-unit MPa, or --length-unit m --stress-unit Pa"
+            f"{next(iter(decks.values()))}: a deck does not say its units; give both, for example length_unit='mm' and"
+            " FieldNames(stress_unit='MPa') (--length-unit mm --stress-unit MPa), or m and Pa"
         )
     names = replace(names, stress_unit=names.stress_unit or "Pa")
     if decks and length_unit in LENGTH_UNITS:

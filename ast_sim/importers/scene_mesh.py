@@ -90,8 +90,8 @@ def read_scene(
     scene = replace(scene, material=_material(mesh, scene, materials, material_fields))
     if not scene.prescribed.any():
         raise ConfigError(
-            f"{mesh.path}: nothing is prescribed: mark a body with --obstacle BODY or nodes with --clamp BODY:PLACE,"
-            " for example --clamp 0:xmin"
+            f"{mesh.path}: nothing is prescribed: mark a body with obstacles=[BODY] (--obstacle BODY) or nodes with"
+            " clamps=['BODY:PLACE'] (--clamp BODY:PLACE), for example 0:xmin"
         )
     scene.check(str(mesh.path))
     looks_wrong = [str(finding) for finding in at_rest(scene)]

@@ -162,7 +162,7 @@ class Answer:
         Raises:
             RolloutError: the answer does not have it; the text names the frames that it has.
         """
-        if number not in self.frames:
+        if number not in self.frames or isinstance(number, bool):
             known = ", ".join(map(str, self.frames[:20])) + (", ..." if len(self.frames) > 20 else "")
             raise RolloutError(f"{self.name}: the answer has no frame {number}; it has: {known or 'none'}", self)
         return self._frame(self.frames.index(number))

@@ -44,7 +44,8 @@ def new_question(
     if isinstance(scene, Trajectory):
         if not (motion is None and num_frames is None and stress is None):
             raise ConfigError(
-                f"{name} has a motion, frames and a stress of its own; for others predict its scene (--move BODY=X,Y,Z)"
+                f"{name} has a motion, frames and a stress of its own; for others predict its scene:"
+                " motion={BODY: (x, y, z)} (--move BODY=X,Y,Z)"
             )
         _require_whole(scene, config, scope, name)
         fields = fields_of(scene)
@@ -128,12 +129,14 @@ def _completed(
 ) -> Motion:
     """The motion of the prescribed nodes in every frame."""
     if motion is None or (isinstance(motion, Mapping) and not motion):
-        raise ConfigError(f"{name}: say how its prescribed nodes move: {{BODY: (x, y, z)}} (--move BODY=X,Y,Z)")
+        raise ConfigError(f"{name}: say how its prescribed nodes move: motion={{BODY: (x, y, z)}} (--move BODY=X,Y,Z)")
     (frames,) = whole(num_frames=frames)
     if isinstance(motion, Mapping):
         least = config.data.given_frames + 1
         if frames is None and not scope.usual_increment:
-            raise ConfigError(f"{name}: nothing is moved in the training scenes: say how many frames (--num-frames)")
+            raise ConfigError(
+                f"{name}: nothing is moved in the training scenes: say how many frames, num_frames=N (--num-frames N)"
+            )
         if frames is None:
             frames = max(least, frames_for(scene, motion, scope.usual_increment))
         if frames < least:
@@ -173,9 +176,11 @@ def _require_material(config: ModelConfig, scope: Scope, scene: Scene, name: str
     if given == wanted:
         return
     if not wanted:
-        raise ConfigError(f"{name} has a material, but the run was trained without one: leave it out (--material)")
+        raise ConfigError(
+            f"{name} has a material, but the run was trained without one: leave out materials= (--material)"
+        )
     ranges = ", ".join(f"{column} {low:.4g} to {high:.4g}" for column, (low, high) in scope.material_ranges.items())
     raise ConfigError(
         f"{name} has {given or 'no'} material columns, but the run was trained with {wanted} ({ranges}): give each"
-        " body its numbers (--material BODY=NUMBER,...)"
+        " body its numbers: materials={BODY: (NUMBER, ...)} (--material BODY=NUMBER,...)"
     )

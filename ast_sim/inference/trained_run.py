@@ -13,6 +13,7 @@ import numpy as np
 
 from ast_sim.dataset.layout import DatasetInfo
 from ast_sim.dataset.reader import Dataset
+from ast_sim.figures import SOLVER_SCENES
 from ast_sim.importers.scene_mesh import SceneMesh
 from ast_sim.inference.answer import Answer
 from ast_sim.inference.answering import doubts, in_domain
@@ -50,8 +51,7 @@ class Run:
         settings: the settings of the model and of the training.
         step: the step of the checkpoint.
         folder: the files of the run.
-        effort: what follows the first call by default, as validation has decided; nothing for a model that predicts
-            step by step.
+        effort: what follows the first call by default, as validation has decided; none in predictions step by step.
         calibration: how far its answers are from the truth, as `ast_sim.calibrate` has measured; or None.
         scope: the ranges of sizes, materials and motions in the training scenes.
 
@@ -323,7 +323,7 @@ class Run:
         data: str | os.PathLike[str] | Dataset | None = None,
         split: str = "test",
         command: str = "Run.evaluate",
-        solver_scenes: int = 0,
+        solver_scenes: int = SOLVER_SCENES,
         made_from: str | os.PathLike[str] | None = None,
         progress: ShowProgress = True,
     ) -> Evaluation:
@@ -332,17 +332,17 @@ class Run:
         Args:
             data: a dataset, its path or open; by default the one that the run was trained on.
             command: the command that is recorded beside the figures.
-            solver_scenes: the number of scenes in which the solver solves the deepest frame, too, in several variants.
+            solver_scenes: in how many scenes the solver solves the deepest frame, too, in several variants; 0: in none.
             made_from: the specification or the parts of your own of which the dataset was made; the solver needs them.
             progress: as in `generate`; it counts scenes, once for all frames, once for the deepest, once solved.
         """
         (solver_scenes,) = whole(0, solver_scenes=solver_scenes)
         with self.open(data) as dataset:
-            with Progress(2 * dataset.count(split) + solver_scenes, "scenes", progress) as bar:
+            steps = 2 * dataset.count(split) + min(solver_scenes, dataset.count(split))
+            with Progress(steps, "scenes", progress) as bar:
                 figures = evaluate(self.model, dataset, split, bar.advance, self.effort, solver_scenes, made_from)
             origin = {"run": str(self.path), "step": self.step, "data": str(dataset.path), "split": split}
-            figures = dataclasses.replace(figures, origin={**provenance(command), **origin})
-            return Evaluation(self, dataset.path, figures)
+            return Evaluation(self, dataset.path, dataclasses.replace(figures, origin=provenance(command) | origin))
 
     def report(self, path: str | os.PathLike[str], data: str | os.PathLike[str] | Dataset | None = None) -> None:
         """Evaluate on the test split and write a page with the results."""

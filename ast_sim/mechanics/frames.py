@@ -164,7 +164,9 @@ class Frames(ABC):
         def before_step(steps: int) -> None:
             checkpoint.progress(len(self.records), count, steps)
             if not patient and steps - self._steps_before > MAX_FRAME_ITERATIONS:
-                raise GivenUp(f"more than {MAX_FRAME_ITERATIONS} Newton iterations (--patient has no limit)")
+                raise GivenUp(
+                    f"more than {MAX_FRAME_ITERATIONS} Newton iterations; patient=True (--patient) has no limit"
+                )
 
         self.watch(before_step)
         status: dict[str, AttributeValue] = {"status": "complete"}

@@ -12,6 +12,8 @@ from collections.abc import Iterable
 from types import ModuleType
 from typing import Any
 
+RESUME = "go on with resume=True (--resume)"  # what to do where a training has stopped
+
 
 class AstSimError(Exception):
     """Base of all errors that a user can act on."""

@@ -27,7 +27,7 @@ from ast_sim.number_arrays import percent
 from ast_sim.runs import checkpoint
 from ast_sim.runs.folder import RunFolder
 from ast_sim.runs.train_config import RunConfig, TrainConfig
-from ast_sim.support.errors import DatasetError, TrainingError
+from ast_sim.support.errors import RESUME, DatasetError, TrainingError
 from ast_sim.support.progress import Clock, ShowProgress, duration
 from ast_sim.support.stop_signals import Interrupted, StopSignals
 from ast_sim.training.callbacks import Callback, Listener
@@ -187,7 +187,7 @@ class Training:
 
     def _stop_if_requested(self) -> None:
         if self.stopping:
-            self.progress.line(f"stopped after step {self.step:,}: go on with --resume")
+            self.progress.line(f"stopped after step {self.step:,}: {RESUME}")
             if self.listener.error is not None:
                 raise self.listener.error
             raise Interrupted(self.stopping)

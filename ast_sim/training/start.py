@@ -24,7 +24,7 @@ from ast_sim.runs.config_toml import has_config, write_config
 from ast_sim.runs.folder import RunFolder
 from ast_sim.runs.train_config import RunConfig
 from ast_sim.support.argument_checks import file_name, in_short, require_bool
-from ast_sim.support.errors import CheckpointError, ConfigError, TrainingError
+from ast_sim.support.errors import RESUME, CheckpointError, ConfigError, TrainingError
 from ast_sim.support.progress import ShowProgress
 from ast_sim.support.stop_signals import StopSignals
 from ast_sim.training.callbacks import Callback
@@ -154,7 +154,7 @@ def start_training(
     ):
         saved = processes.of_leader(folder.settings if has_config(folder.path) else None)
         if saved is not None and not resume:
-            raise TrainingError(f"{run} already holds a run: go on with --resume, or choose another folder")
+            raise TrainingError(f"{run} already holds a run: {RESUME}, or choose another folder")
         wanted = config or saved
         if wanted is None:
             raise TrainingError(f"{run} holds no run to resume: name the dataset to start one")
@@ -215,7 +215,7 @@ def _explained(run: Path) -> Iterator[None]:
         raise
     except OSError as error:
         full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-        advice = ": the last checkpoint is complete; make room, then go on with --resume" if full else ""
+        advice = f": the last checkpoint is complete; make room, then {RESUME}" if full else ""
         raise TrainingError(f"{run}: {error}{advice}") from error
 
 

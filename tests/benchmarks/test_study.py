@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import toy
-from toy import one_thread  # noqa: F401
 
 from ast_sim.inference.answer import Answer
 from ast_sim.mechanics.unfinished import Checkpoint

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 import toy
-from toy import one_thread  # noqa: F401 (used by being imported)
 
 import ast_sim
 from ast_sim.batches.batch_builder import Batch, State, Target

@@ -9,7 +9,6 @@ import numpy as np
 import toy
 from meshes import box
 from test_pages import blocks, calls_of
-from toy import one_thread  # noqa: F401 (used by being imported)
 from vtk_series import read
 
 from ast_sim.cli import main

@@ -314,7 +314,7 @@ def test_every_split_gets_a_simulation_if_there_are_enough(tmp_path, count, shar
 @pytest.mark.parametrize("count", [1, 2])
 def test_fewer_than_three_simulations_need_shares(tmp_path, count):
     many(tmp_path / "r", count)
-    with pytest.raises(DatasetError, match=f"need three simulations, found: {count}; say with --shares where they go"):
+    with pytest.raises(DatasetError, match=f"need three simulations, found: {count}; say where they go"):
         convert(tmp_path / "r", tmp_path / "d.h5")
     assert not (tmp_path / "d.h5").exists()
 
@@ -522,7 +522,9 @@ def test_fields_that_were_not_used_are_named_with_their_options(tmp_path):
         r"r/run_\d: nothing moves and nothing is prescribed; these fields were not used: U", str(error.value)
     )
     options = "--displacement U --stress S_Mises --obstacle tool --handle fixed"
-    assert f"; try {options}; " in str(error.value) and "temperature (--stress|--body)" in str(error.value)
+    arguments = "displacement='U', stress='S_Mises', obstacle='tool', handle='fixed'"
+    assert f"; try {options}, in Python names=FieldNames({arguments}); " in str(error.value)
+    assert "temperature (--stress|--body)" in str(error.value)
     assert not (tmp_path / "d.h5").exists()
     names = FieldNames(displacement="U", stress="S_Mises", obstacle="tool", handle="fixed")
     assert convert(source, tmp_path / "d.h5", names=names) == counted(1, 1, 1)

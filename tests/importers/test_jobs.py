@@ -159,7 +159,7 @@ def test_one_command_makes_a_dataset(press, tmp_path, capsys):
     job, results = press
     command = ["convert", str(job), str(results), "--out", str(tmp_path / "d.h5"), "--shares", "1", "0", "0"]
     assert cli.main(command) == 2
-    assert "give both, for example --length-unit mm --stress-unit MPa" in capsys.readouterr().err
+    assert "(--length-unit mm --stress-unit MPa)" in capsys.readouterr().err
     assert cli.main([*command, "--length-unit", "mm", "--stress-unit", "MPa"]) == 0
     told = capsys.readouterr().out
     assert "the columns of the material are young, poisson, yield_stress" in told

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from blocks import block
 from test_jobs import faces_at
-from toy import one_thread  # noqa: F401
 
 import ast_sim
 from ast_sim import Dataset, cli

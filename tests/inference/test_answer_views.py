@@ -44,6 +44,8 @@ def test_frames_one_by_one():
     assert answer("none").frame(2).stress is None
     with pytest.raises(RolloutError, match="toy: the answer has no frame 4; it has: 5, 2, 3"):
         found.frame(4)
+    with pytest.raises(RolloutError, match="the answer has no frame True"):
+        found.frame(True)
 
 
 def pixels(found: Answer, number: int | None = None) -> np.ndarray:

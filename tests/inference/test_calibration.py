@@ -150,7 +150,9 @@ def test_what_cannot_be_calibrated_is_refused(calibrated):
     run, data, _ = calibrated
     with pytest.raises(ConfigError, match="have trained or chosen the run"):
         ast_sim.calibrate(run, data, "train")
-    with pytest.raises(ConfigError, match="there are 0: make more with --calibration N"):
+    with pytest.raises(
+        ConfigError, match=r"there are 0: make more with generate\(..., calibration=N\) \(--calibration N\)"
+    ):
         ast_sim.calibrate(run, data)
     assert run.calibration == calibrated[2]  # what was known stays known
     assert Calibration.from_json(calibrated[2].to_json()) == calibrated[2]

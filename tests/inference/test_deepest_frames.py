@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 import toy
-from toy import one_thread  # noqa: F401 (used by being imported)
 
 from ast_sim import Dataset, generate
 from ast_sim.figures import VariantFigures

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from toy import one_thread  # noqa: F401 (used by being imported)
 
 import ast_sim
 from ast_sim.cli import main

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import toy
 from simulate.own_assembly.assemblies import write_assembly
-from toy import one_thread  # noqa: F401 (used by being imported)
 
 import ast_sim
 from ast_sim.dataset.writer import DatasetWriter

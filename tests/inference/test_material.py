@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import toy
-from toy import one_thread  # noqa: F401 (used by being imported)
 
 from ast_sim import Answer, Dataset, DatasetInfo, DatasetWriter, Effort, Material, Run, example_run, generate, train
 from ast_sim.batches.out_of_balance import ElasticTetrahedra

@@ -12,7 +12,6 @@ import torch
 import toy
 from checks import made_once
 from meshes import box_between, plate_and_punch
-from toy import one_thread  # noqa: F401 (used by being imported)
 from vtk_series import read
 
 from ast_sim import Dataset, DatasetWriter, Effort, Motion, Run, generate, read_scene, train
@@ -118,7 +117,8 @@ def test_the_prescribed_nodes_move_as_far_in_a_frame_as_in_training(run, monkeyp
     assert len(run.predict(scene, PRESS, num_frames=9).position) == 9
     monkeypatch.setattr(run, "scope", replace(run.scope, usual_increment=0.0))
     with pytest.raises(
-        ConfigError, match=r"nothing is moved in the training scenes: say how many frames \(--num-frames\)"
+        ConfigError,
+        match=r"nothing is moved in the training scenes: say how many frames, num_frames=N \(--num-frames N\)",
     ):
         run.predict(scene, PRESS)
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 import toy
-from toy import one_thread  # noqa: F401
 
 import ast_sim
 from ast_sim import Dataset

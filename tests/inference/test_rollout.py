@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 import toy
-from toy import one_thread  # noqa: F401 (used by being imported)
 
 from ast_sim.batches.batch_builder import Batch
 from ast_sim.models.ast.network import AST

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import toy
-from toy import one_thread  # noqa: F401 (used by being imported)
 
 from ast_sim.dataset.reader import Dataset
 from ast_sim.dataset.writer import DatasetWriter
@@ -28,6 +27,7 @@ def test_how_the_checkpoint_was_chosen_is_said(tmp_path, validated, choice):
     start_training(tmp_path / "run", configure(data, "tiny", SETTINGS, model="mgn"))
     run = Run(tmp_path / "run")
     evaluation = run.evaluate()
+    assert "no solver to compare with" in evaluation.figures.deepest.no_solver  # by default it is wanted
     shown = evaluation.shown()
     assert shown.model == "mgn" and shown.facts["Checkpoint"] == f"step {run.step}, {choice}"
     assert [scene.prediction.stress_location for scene in shown.scenes] == ["node"]

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 import toy
-from toy import one_thread  # noqa: F401 (used by being imported)
 
 import ast_sim
 from ast_sim.cli import main

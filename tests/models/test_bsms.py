@@ -8,7 +8,6 @@ import torch
 import torch.nn.functional as F
 import toy
 from graph_models import assert_follows, batch_of, deep_mlp, made, resolved, with_stress
-from toy import one_thread  # noqa: F401
 
 from ast_sim.models.bsms import PRESETS, BSMSConfig
 from ast_sim.models.node_inputs import node_features

@@ -8,7 +8,6 @@ import torch
 import torch.nn.functional as F
 from checks import assert_accurate
 from graph_models import assert_follows, batch_of, deep_mlp, made, resolved, with_stress
-from toy import one_thread  # noqa: F401
 
 from ast_sim.models import hcmt as attention_module
 from ast_sim.models.hcmt import PRESETS, HCMTConfig, channel_attention

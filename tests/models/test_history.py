@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 import toy
-from toy import one_thread  # noqa: F401 (used by being imported)
 
 from ast_sim import Dataset, train
 from ast_sim.inference.answering import answers

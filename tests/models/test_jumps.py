@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 import toy
-from toy import one_thread  # noqa: F401 (used by being imported)
 
 from ast_sim.batches.carry import Carrier
 from ast_sim.batches.pairs import PairSampler

@@ -5,7 +5,6 @@ from dataclasses import replace
 import pytest
 import torch
 from graph_models import assert_follows, batch_of, deep_mlp, made, resolved, with_stress
-from toy import one_thread  # noqa: F401
 
 from ast_sim.batches.graph import edge_vectors
 from ast_sim.models.mgn import PRESETS, MGNConfig

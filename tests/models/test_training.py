@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import toy
-from toy import one_thread  # noqa: F401
 
 from ast_sim.models.data_facts import DataFacts
 from ast_sim.models.registry import find_model, find_preset

@@ -12,7 +12,6 @@ from checks import errors
 from meshes import box
 from torch import Tensor
 from torch.func import functional_call
-from toy import one_thread  # noqa: F401 (used by being imported)
 
 from ast_sim.batches.batch_builder import Batch
 from ast_sim.batches.graph import Graph

@@ -6,7 +6,6 @@ from types import SimpleNamespace
 
 import pytest
 import toy
-from toy import one_thread  # noqa: F401 (used by being imported)
 
 import ast_sim
 from ast_sim.planning import plan as plan_module

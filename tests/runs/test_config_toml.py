@@ -5,7 +5,6 @@ import shutil
 
 import pytest
 import toy
-from toy import one_thread  # noqa: F401 (used by being imported)
 
 from ast_sim.cli import main
 from ast_sim.runs import checkpoint

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import toy
-from toy import one_thread  # noqa: F401 (used by being imported)
 
 from ast_sim import Dataset, DatasetWriter, Run, train
 from ast_sim.cli import main

@@ -4,7 +4,6 @@ import sys
 
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from toy import one_thread  # noqa: F401 (used by being imported)
 
 import ast_sim
 from ast_sim.runs import checkpoint

@@ -150,7 +150,9 @@ def test_a_process_that_is_killed_ends_the_training_with_its_cause(data, tmp_pat
     finally:
         process.kill()
     assert process.returncode == 2
-    assert error.strip() == ("ast-sim train: a process that trains along has ended (signal 9): go on with --resume")
+    assert error.strip() == (
+        "ast-sim train: a process that trains along has ended (signal 9): go on with resume=True (--resume)"
+    )
 
 
 def test_a_batch_that_cannot_be_cut_is_refused(data, tmp_path):

@@ -3,7 +3,6 @@
 import pytest
 import torch
 import toy
-from toy import one_thread  # noqa: F401 (used by being imported)
 
 from ast_sim.cli import main
 from ast_sim.ops import library, segment_sum

@@ -3,7 +3,6 @@
 from types import SimpleNamespace
 
 import pytest
-from toy import one_thread  # noqa: F401 (used by being imported)
 
 from ast_sim.runs.config_toml import read_config
 from ast_sim.runs.metrics import Metrics

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 import toy
-from toy import one_thread  # noqa: F401 (used by being imported)
 
 from ast_sim.dataset.reader import Dataset
 from ast_sim.dataset.writer import DatasetWriter
@@ -371,7 +370,7 @@ def test_a_failing_validation_rollout_is_recorded_and_training_goes_on(linear, d
 
 def test_a_run_is_not_overwritten(linear, data, tmp_path):
     start.start_training(tmp_path / "run", settings(data, "train.steps=2"))
-    with pytest.raises(TrainingError, match="already holds a run: go on with --resume"):
+    with pytest.raises(TrainingError, match=r"already holds a run: go on with resume=True \(--resume\)"):
         start.start_training(tmp_path / "run", settings(data))
 
 

@@ -129,7 +129,7 @@ def test_signals_finish_the_step_write_a_checkpoint_and_exit(undisturbed, tmp_pa
     wait_for_progress(process, run, -1)
     process.send_signal(number)
     out, error = finish(process, code)
-    assert f"stopped after step {newest(run)}: go on with --resume" in out
+    assert f"stopped after step {newest(run)}: go on with resume=True (--resume)" in out
     assert "Traceback" not in error
     assert 0 < newest(run) < STEPS
     finish(start("--out", run, "--resume"))

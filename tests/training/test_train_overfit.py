@@ -2,7 +2,6 @@
 
 import numpy as np
 import toy
-from toy import one_thread  # noqa: F401 (used by being imported)
 
 from ast_sim.dataset.reader import Dataset
 from ast_sim.inference.evaluation.evaluate import one_step_predictions

@@ -48,7 +48,7 @@ def require_near(mesh: SourceMesh, corners: np.ndarray, middles: np.ndarray, row
         raise DatasetError(
             f"{mesh.path}: element {rows[element]} has its node {middles[element, edge]} far from the middle of the"
             f" edge from {corners[element, MIDDLES[edge][0]]} to {corners[element, MIDDLES[edge][1]]}: are its nodes"
-            " in the order of VTK? With --corners, only the corners are taken"
+            " in the order of VTK? With corners=True (--corners), only the corners are taken"
         )
 
 

@@ -231,5 +231,8 @@ def _not_in_a_scene(deck: Deck) -> list[str]:
         )
     if names & _CONSTRAINTS:
         listed = ", ".join(sorted(names & _CONSTRAINTS))
-        notes.append(f"constraints are not read: {listed}; mark nodes that they move with --handle or --obstacle")
+        notes.append(
+            f"constraints are not read: {listed}; mark nodes that they move by FieldNames(handle=NAME)"
+            " or FieldNames(obstacle=NAME) (--handle NAME, --obstacle NAME)"
+        )
     return notes

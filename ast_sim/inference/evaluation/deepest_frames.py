@@ -59,16 +59,10 @@ def deepest_frames(
             advance(scenes[-1].name)
     finally:
         torch.set_num_threads(threads)
-    why = None
-    try:
-        numbers = [scene.frame for scene in scenes[:solver_scenes]]
-        outcomes = _solved(dataset, split, indices[:solver_scenes], numbers, made_from)
-        for number, one in enumerate(outcomes):
-            solver = _solver(one, scenes[number].relative_error)
-            scenes[number] = dataclasses.replace(scenes[number], solver=solver)
-            advance(scenes[number].name)
-    except (ConfigError, SimulationError) as error:
-        why = str(error)
+    first = scenes[:solver_scenes]
+    outcomes = _solved(dataset, split, indices[:solver_scenes], [scene.frame for scene in first], made_from)
+    solved, why = _with_solver(first, outcomes, advance)
+    scenes = [*solved, *scenes[len(solved) :]]
     known = [scene for scene in scenes if scene.relative_error is not None]
     return DeepestFrames(
         scenes=tuple(scenes),
@@ -88,7 +82,26 @@ def _solved(
     dataset: Dataset, split: str, indices: list[int], frames: list[int], made_from: str | os.PathLike[str] | None
 ) -> Iterable[SolverOutcomes]:
     """What the solver took to these frames; nothing, where none is wanted."""
-    return solver_outcomes(dataset.path, split, indices, frames, made_from=made_from, progress=False) if indices else ()
+    if indices:
+        yield from solver_outcomes(dataset.path, split, indices, frames, made_from=made_from, progress=False)
+
+
+def _with_solver(
+    scenes: list[DeepestFrame], outcomes: Iterable[SolverOutcomes], advance: Callable[[str], None]
+) -> tuple[list[DeepestFrame], str | None]:
+    """The scenes with what the solver took; and why it ended before the last one, if it did. `advance` is called for
+    each scene all the same, so that what counts them comes to its end."""
+    solved: list[DeepestFrame] = []
+    why = None
+    try:
+        for scene, one in zip(scenes, outcomes, strict=True):
+            solved.append(dataclasses.replace(scene, solver=_solver(one, scene.relative_error)))
+            advance(scene.name)
+    except (ConfigError, SimulationError) as error:
+        why = str(error)
+    for scene in scenes[len(solved) :]:
+        advance(scene.name)
+    return solved, why
 
 
 def deepest_predicted(model: Simulator, truth: Trajectory) -> int:

@@ -134,7 +134,8 @@ def _require_one_dataset(evaluations: Sequence[Evaluation]) -> None:
         if one.content() != known:
             raise ConfigError(
                 f"{one.run.path} was evaluated on other scenes ({one.data.name}) than {first.run.path}"
-                f" ({first.data.name}), or in another unit: a page compares runs on one dataset (--data)"
+                f" ({first.data.name}), or in another unit: a page compares runs on one dataset, data=FILE"
+                " (--data FILE)"
             )
 
 

@@ -273,7 +273,7 @@ def _measured(run: Run, dataset: Dataset, split: str, progress: ShowProgress) ->
     if len(scenes) < FEWEST:
         raise ConfigError(
             f"a band of {100 * LEVEL:g} % needs at least {FEWEST} calibration scenes, and there are {len(scenes)}: make"
-            " more with --calibration N"
+            " more with generate(..., calibration=N) (--calibration N)"
         )
     quantiles, typical = _quantiles([one.comparisons for one in scenes])
     spacings = [one.spacing for one in scenes]

@@ -15,7 +15,7 @@ import importlib
 from dataclasses import dataclass
 from types import ModuleType
 
-from ast_sim.support.errors import ConfigError
+from ast_sim.support.errors import ConfigError, nearest_name
 
 
 @dataclass(frozen=True)
@@ -58,5 +58,5 @@ def family_module(family: str) -> ModuleType:
         MissingExtra: an extra that the family needs is not installed.
     """
     if family not in FAMILIES:
-        raise ConfigError(f"there is no scene family {family!r}; use one of {', '.join(FAMILIES)}")
+        raise ConfigError(f"there is no scene family {family!r}{nearest_name(family, FAMILIES)}")
     return importlib.import_module(MODULES[family])

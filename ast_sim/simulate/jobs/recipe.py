@@ -8,7 +8,6 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import asdict
 from itertools import pairwise
-from operator import index
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -60,7 +59,7 @@ def checked_recipe(
     nodes = module.DEFAULT_NODES if nodes is None else nodes
     if "spec" in FAMILIES[family].options:
         if spec is None:
-            raise ConfigError(f"{family} needs a specification: ast-sim generate {family} SPEC.toml --out FILE")
+            raise ConfigError(f"{family} needs a specification: spec=FILE (ast-sim generate {family} FILE --out DATA)")
         frames = read_spec(spec).frames if frames is None else frames
     if "frames" in FAMILIES[family].options:
         frames = module.FRAMES if frames is None else frames
@@ -79,7 +78,7 @@ def checked_recipe(
     if solver == "own" and yielding:
         raise ConfigError(
             f"{', '.join(yielding)}: the own solver knows elastic laws only, and this one is elastoplastic: CalculiX"
-            " solves it (leave --solver out, or --solver calculix)"
+            " solves it: solver='calculix' (--solver calculix), which is what no solver= stands for here"
         )
     if solver not in SOLVERS:
         raise ConfigError(f"there is no solver {solver!r}; use one of {', '.join(SOLVERS)}")
@@ -116,7 +115,7 @@ def recipe_of(name: str, info: DatasetInfo, made_from: str | os.PathLike[str] | 
     if key is None and made_from is not None:
         raise ConfigError(f"{name} was made without parts of your own or a specification: leave {made_from} out")
     if key is not None and made_from is None:
-        raise ConfigError(f"{name} was made of {own[key]}: say where to find that (--made-from)")
+        raise ConfigError(f"{name} was made of {own[key]}: say where to find that: made_from=PATH (--made-from PATH)")
     parts, spec = (None if made_from is None or key != which else file_name(made_from, "made_from") for which in own)
     try:
         numbers = whole(seed=made["seed"], nodes=made.get("nodes"), frames=made.get("frames"))
@@ -137,7 +136,7 @@ def recipe_of(name: str, info: DatasetInfo, made_from: str | os.PathLike[str] | 
 def _checked_keep(keep: Sequence[int], last: int) -> tuple[int, ...]:
     """The numbers of the frames to keep, after a check; `last` is the number of the last frame."""
     try:
-        kept = tuple(map(index, keep))
+        kept = tuple(whole(**{f"keep[{place}]": frame for place, frame in enumerate(keep)}))
     except TypeError as error:
         raise ConfigError(f"keep is {keep!r}; must be a list of whole numbers") from error
     if not kept or not all(1 <= frame <= last for frame in kept):

@@ -19,7 +19,7 @@ import torch
 
 from ast_sim.dataset.reader import Dataset
 from ast_sim.runs.train_config import RunConfig
-from ast_sim.support.errors import ConfigError, TrainingError
+from ast_sim.support.errors import RESUME, ConfigError, TrainingError
 from ast_sim.support.toml_settings import require_range
 
 LEAST_NODES = 3000  # of a process in a step; below, two processes are no faster than one (docs/log.md, 2026-11-27)
@@ -167,9 +167,7 @@ class _Helper:
         except subprocess.TimeoutExpired:
             return
         if failed:
-            raise TrainingError(
-                f"a process that trains along has ended ({self._reason()}): go on with --resume"
-            ) from error
+            raise TrainingError(f"a process that trains along has ended ({self._reason()}): {RESUME}") from error
 
     def _reason(self) -> str:
         code = self.process.wait(PATIENCE)

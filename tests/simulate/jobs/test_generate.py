@@ -327,7 +327,7 @@ def test_two_runs_on_one_file_exclude_each_other(tmp_path):
     [
         (
             {"family": "deforming_plates"},
-            "no scene family 'deforming_plates'; use one of deforming_plate, sphere_simple, abcd, abcd_xl",
+            "no scene family 'deforming_plates'; did you mean 'deforming_plate'\\?",
         ),
         ({"train": 0}, "not all 0"),
         ({"seed": -1}, "seed is -1; must be from 0 to"),
@@ -347,7 +347,8 @@ def test_two_runs_on_one_file_exclude_each_other(tmp_path):
         ({"family": "abcd", "keep": [21]}, r"keep is \[21\]; must be numbers of frames from 1 to 20"),
         ({"keep": [3, 2]}, r"keep is \[3, 2\]; the numbers of frames must ascend"),
         ({"keep": 3}, r"keep is 3; must be a list of whole numbers"),
-        ({"keep": [3.5]}, r"keep is \[3.5\]; must be a list of whole numbers"),
+        ({"keep": [3.5]}, r"keep\[0\] is 3.5; it must be a whole number"),
+        ({"keep": [True]}, r"keep\[0\] is True; it must be a whole number"),
         ({"train": 2.0}, r"train is 2.0; it must be a whole number"),
         ({"train": "2"}, r"train is '2'; it must be a whole number"),
         ({"valid": 1.0}, r"valid is 1.0; it must be a whole number"),
