@@ -55,12 +55,12 @@ lint: $(VENV)/tested
 docs: $(VENV)/installed
 	$(BIN)/python docs/make_reference.py
 
-BUILDS := sanitized valgrind races $(if $(X86),aarch64 wide) plain gcc11 clang
+BUILDS := sanitized uninitialised races $(if $(X86),aarch64 wide) plain gcc11 clang
 CHECKS := $(foreach build,$(BUILDS),$(patsubst %,build/check/$(build)/%.passed,$(SLOW_FIRST))) \
   $(addprefix build/check/fuzz_,$(addsuffix .passed,$(C_FUZZERS)))
 
 # The C tests, which need no Python: optimised, under the address and undefined behaviour sanitizers, under the thread sanitizer,
-# under valgrind, and as GCC 11, clang and GCC for aarch64 (on an emulator) compile them. `wide` compiles the 64-byte source for AVX2, so
+# under the memory sanitizer (what is read before it is written), and as GCC 11, clang and GCC for aarch64 (on an emulator) compile them. `wide` compiles the 64-byte source for AVX2, so
 # that its logic is tested where there is no AVX-512. The kept inputs of the fuzz targets run once more.
 # Each test of each build is a target of its own, those that take longest first, so that with `--jobs` no core is left idle in the end.
 check: $(CHECKS)
@@ -107,7 +107,7 @@ $(VENV)/benched: $(VENV)/installed
 
 # System programs that the tests use: what is missing, and how to get it. Nothing is installed but by `make install-tools`; then one at a time if
 # not all together: a system that does not know one of them still gets the others.
-COMMANDS := chromium valgrind clang gcc-11 $(if $(X86),aarch64-linux-gnu-gcc:gcc-aarch64-linux-gnu qemu-aarch64:qemu-user) ccx:calculix-ccx
+COMMANDS := chromium clang gcc-11 $(if $(X86),aarch64-linux-gnu-gcc:gcc-aarch64-linux-gnu qemu-aarch64:qemu-user) ccx:calculix-ccx
 FIND_MISSING := missing=; for tool in $(COMMANDS); do command -v $${tool%:*} >/dev/null || missing="$$missing $${tool\#*:}"; done; \
 	ldconfig -p | grep -q libGLU.so.1 || missing="$$missing libglu1-mesa libxft2 libxcursor1 libxinerama1 libxrender1 libxfixes3"; \
 	ls $$(clang -print-resource-dir 2>/dev/null)/lib/linux/*fuzzer* >/dev/null 2>&1 || missing="$$missing libclang-rt-14-dev"; \
@@ -138,7 +138,7 @@ COMPILE_plain := $(GCC) -O3
 # -O0 would save 50 s of compiling the sanitized kernels and cost 80 s of running them.
 COMPILE_sanitized := $(GCC) -O1 -g -DAST_UNFUSED -fsanitize=$(SANITIZE) -fno-sanitize-recover=all
 COMPILE_races := $(CLANG) -O1 -g -DAST_UNFUSED -fsanitize=thread
-COMPILE_valgrind := $(GCC) -O1 -g -DAST_UNFUSED
+COMPILE_uninitialised := $(CLANG) -O1 -g -DAST_UNFUSED -fsanitize=memory -fno-sanitize-recover=all
 # -O0: the optimiser takes minutes over unrolled products with all these checks in them. Comparisons are not traced, nor branches of the
 # targets themselves: the sizes that a kernel compares do not stand in an input, and the tracing took most of the time.
 COMPILE_fuzz := $(CLANG) -O0 -g -fsanitize=fuzzer-no-link,$(SANITIZE) -fno-sanitize-coverage=trace-cmp -fno-sanitize-recover=all
@@ -188,14 +188,14 @@ build/check/fuzz_%.passed: build/check/fuzz/fuzz_% csrc/tests/corpus/%
 # The thread sanitizer finds no room for its shadow memory where addresses are too random.
 RUN_sanitized := env ASAN_OPTIONS=detect_leaks=1
 RUN_races = env AST_TEST_QUICK=1 $$(setarch -R true 2>/dev/null && echo setarch -R)
-RUN_valgrind := env AST_TEST_QUICK=1 valgrind --quiet --error-exitcode=1 --leak-check=full
+RUN_uninitialised := env AST_TEST_QUICK=1
 RUN_gcc11 := env AST_TEST_QUICK=1
 RUN_clang := env AST_TEST_QUICK=1
 RUN_aarch64 := env AST_TEST_QUICK=1 qemu-aarch64 -L /usr/aarch64-linux-gnu
 NAME_plain := optimised
 NAME_sanitized := address and undefined behaviour sanitizers
 NAME_races := thread sanitizer
-NAME_valgrind := valgrind
+NAME_uninitialised := memory sanitizer
 NAME_gcc11 := GCC 11
 NAME_clang := clang
 NAME_wide := 64 byte vectors on AVX2

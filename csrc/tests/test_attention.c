@@ -167,7 +167,7 @@ static void test_accuracy(const ast_kernels *kernels) {
                                      {530, 40}, {1100, 20}, {20, 2100}}; /* chunks of queries; scenes cut over queries
                                                                             and over keys */
   static const int64_t widths[] = {16, 32, 48, 64, 128};
-  const bool quick = getenv("AST_TEST_QUICK") != NULL; /* under valgrind */
+  const bool quick = getenv("AST_TEST_QUICK") != NULL; /* where it is slow */
   for (size_t i = 0; i < sizeof sizes / sizeof *sizes; i++)
     for (int kind = 0; kind < (quick && sizes[i][0] + sizes[i][1] > 300 ? 1 : 4); kind++) {
       const int64_t D = widths[(i + (size_t)kind) % 5], H = 1 + (int64_t)(i % 3);

@@ -1,7 +1,7 @@
 /* Farthest point sampling against the greedy definition in 64-bit integers, every distance from every sample. */
 #include "check.h"
 
-static bool quick; /* under valgrind */
+static bool quick; /* where it is slow */
 
 static void greedy(const int32_t *points, int64_t begin, int64_t end, int64_t num, int64_t *indices) {
   const int64_t n = end - begin;

@@ -4,7 +4,7 @@
 
 #include "check.h"
 
-static bool quick; /* under valgrind */
+static bool quick; /* where it is slow */
 
 typedef struct {
   int64_t N, B, *offsets;
