@@ -296,11 +296,11 @@ def test_a_kill_at_any_instant_leaves_a_valid_checkpoint(tmp_path):
     """The saver forks a copy of itself for each kill, so that torch is imported once."""
     program = SAVER.replace('print("ready", flush=True)', "pass")
     server = f"""
-import os, random, signal, sys, time, torch
+import itertools, os, random, signal, sys, time, torch
 from ast_sim.runs import checkpoint
 torch.set_num_threads(1)
 program = compile({program!r}, "saver", "exec")
-for seed in range(30):
+for seed in itertools.count():
     newest = checkpoint.latest(sys.argv[1])
     start = 0 if newest is None else checkpoint.load(newest)[2]["step"]
     child = os.fork()
@@ -311,7 +311,8 @@ for seed in range(30):
     os.kill(child, signal.SIGKILL)
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
     print("killed", flush=True)
-    sys.stdin.readline()
+    if not sys.stdin.readline():
+        break
 """
     process = subprocess.Popen(
         [sys.executable, "-W", "error", "-c", server, str(tmp_path)],
@@ -320,8 +321,10 @@ for seed in range(30):
         text=True,
     )
     last, seen = 0, set()
-    for _ in range(30):
-        assert process.stdout.readline() == "killed\n"
+    rounds = 0
+    while rounds < 30 or len(seen) < 10:  # a busy machine saves little between two kills
+        rounds += 1
+        assert rounds < 1000 and process.stdout.readline() == "killed\n"
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # a damaged checkpoint would be passed over with a warning
             newest, marked = checkpoint.latest(tmp_path), checkpoint.best(tmp_path)
@@ -338,8 +341,8 @@ for seed in range(30):
             seen.add(step)
         process.stdin.write("go on\n")
         process.stdin.flush()
+    process.stdin.close()
     assert process.wait() == 0
-    assert len(seen) > 10
 
 
 def test_a_second_writer_is_refused_until_the_first_ends(tmp_path):
