@@ -1,5 +1,6 @@
 """The command line: every command on real files, and every kind of bad input as one line and exit code 2."""
 
+import inspect
 import json
 import os
 import re
@@ -16,6 +17,7 @@ from data_samples import sign
 
 from ast_sim.cli import build_parser, main
 from ast_sim.dataset.reader import Dataset
+from ast_sim.inference.trained_run import Run
 from ast_sim.support.errors import AstSimError
 from ast_sim.support.toml_settings import settings
 from ast_sim.training.configure import configure
@@ -61,6 +63,11 @@ def test_help_lists_every_command_and_imports_no_torch():
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     for name in ("demo", "generate", "convert", "info", "train", "predict", "evaluate", "report"):
         assert f"\n    {name} " in found.stdout
+
+
+def test_an_evaluation_has_one_default_number_of_scenes_for_the_solver():
+    arguments = build_parser().parse_args(["evaluate", "run", "data.h5"])
+    assert arguments.solver_scenes == inspect.signature(Run.evaluate).parameters["solver_scenes"].default == 3
 
 
 def test_train_help_explains_every_setting(capsys):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 
 from ast_sim.command_line.commands import SPLITS, check_output, open_run
-from ast_sim.figures import SOLVER_SCENES
 from ast_sim.support.argument_types import Parser, add_each, add_out, add_overwrite, at_least, path
 from ast_sim.support.errors import ConfigError
 
@@ -20,8 +19,8 @@ def add_evaluate(evaluate: Parser) -> None:
     evaluate.add_argument("run_folder", type=path, metavar="RUN", help="run folder")
     evaluate.add_argument("data", type=path, metavar="DATA", help="dataset")
     evaluate.add_argument("--split", choices=SPLITS, default="test", help="split (default: test)")
-    about = f"scenes in which the solver solves the deepest frame, to compare (default: {SOLVER_SCENES}; 0: none)"
-    add_each(evaluate, {"--solver-scenes N": about}, type=at_least(0), default=SOLVER_SCENES)
+    about = "scenes in which the solver solves the deepest frame, to compare (default: 3; 0: none)"
+    add_each(evaluate, {"--solver-scenes N": about}, type=at_least(0), default=3)
     _add_made_from(evaluate)
     add_out(evaluate, "FILE.json", "also write all figures to this file", required=False)
 

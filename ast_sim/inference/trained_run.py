@@ -13,7 +13,6 @@ import numpy as np
 
 from ast_sim.dataset.layout import DatasetInfo
 from ast_sim.dataset.reader import Dataset
-from ast_sim.figures import SOLVER_SCENES
 from ast_sim.importers.scene_mesh import SceneMesh
 from ast_sim.inference.answer import Answer
 from ast_sim.inference.answering import doubts, in_domain
@@ -323,7 +322,7 @@ class Run:
         data: str | os.PathLike[str] | Dataset | None = None,
         split: str = "test",
         command: str = "Run.evaluate",
-        solver_scenes: int = SOLVER_SCENES,
+        solver_scenes: int = 3,
         made_from: str | os.PathLike[str] | None = None,
         progress: ShowProgress = True,
     ) -> Evaluation:

@@ -202,7 +202,7 @@ WRONG = {
     "nothing prescribed": (
         MESH,
         {},
-        "mesh: nothing is prescribed: mark a body with --obstacle BODY or nodes with --cl",
+        r"mesh: nothing is prescribed: mark a body with obstacles=\[BODY\] \(--obstacle BODY\) or nodes with clamps=",
     ),
     "flat": (with_fields(tets=FLAT), PRESCRIBED, r"element 5 with the nodes \[0, 1, 2, .*\] has no volume; 1 of 6"),
     "flat triangles": (

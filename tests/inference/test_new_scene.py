@@ -330,7 +330,7 @@ POSITIONS = np.repeat(scene_of().rest_position[None], 3, axis=0)
 @pytest.mark.parametrize(
     ("motion", "options", "message"),
     [
-        (None, {}, r"say how its prescribed nodes move: {BODY: \(x, y, z\)} \(--move BODY=X,Y,Z\)"),
+        (None, {}, r"say how its prescribed nodes move: motion={BODY: \(x, y, z\)} \(--move BODY=X,Y,Z\)"),
         ({}, {}, "say how its prescribed nodes move"),
         ({2: (0, 0, 1)}, {}, "there is no body 2"),
         ({1: (0, 1)}, {}, "translation of a motion must be three numbers"),
@@ -432,5 +432,5 @@ def test_a_material_that_the_run_has_not_seen_is_told(dynamic_run):
 def test_a_material_that_the_run_does_not_take_is_refused(run):
     scene = scene_of()
     scene = replace(scene, material=np.ones((scene.num_elements, 1), np.float32))
-    with pytest.raises(ConfigError, match="scene has a material, but the run was trained without one: leave it out"):
+    with pytest.raises(ConfigError, match="a material, but the run was trained without one: leave out materials="):
         run.predict(scene, PRESS)
