@@ -6,9 +6,10 @@ import re
 import numpy as np
 import pytest
 import pyvista
-import vtkmodules.all as vtk
 from blocks import block
 from vtkmodules.util.numpy_support import numpy_to_vtkIdTypeArray
+from vtkmodules.vtkCommonDataModel import vtkCompositeDataSet, vtkMultiBlockDataSet
+from vtkmodules.vtkIOXML import vtkXMLMultiBlockDataWriter, vtkXMLUnstructuredGridWriter
 
 from ast_sim.importers.series import FieldNames, read_series
 from ast_sim.support.errors import DatasetError
@@ -36,12 +37,12 @@ def grid(points, elements=CUBE.elements, ids=None):
 
 
 def write_vtm(path, parts, names=()):
-    blocks = vtk.vtkMultiBlockDataSet()
+    blocks = vtkMultiBlockDataSet()
     for index, part in enumerate(parts):
         blocks.SetBlock(index, part)
     for index, name in enumerate(names):
-        blocks.GetMetaData(index).Set(vtk.vtkCompositeDataSet.NAME(), name)
-    writer = vtk.vtkXMLMultiBlockDataWriter()
+        blocks.GetMetaData(index).Set(vtkCompositeDataSet.NAME(), name)
+    writer = vtkXMLMultiBlockDataWriter()
     writer.SetFileName(str(path))
     writer.SetInputData(blocks)
     writer.Write()
@@ -51,7 +52,7 @@ def write_vtu(path, parts):
     """The pieces of one file, as programs with several processes write them."""
     texts = []
     for part in parts:
-        writer = vtk.vtkXMLUnstructuredGridWriter()
+        writer = vtkXMLUnstructuredGridWriter()
         writer.SetInputData(part)
         writer.SetDataModeToAscii()
         writer.SetWriteToOutputString(True)
