@@ -14,6 +14,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import warnings
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -29,7 +30,7 @@ from ast_sim.importers.formats.declared_sizes import (
     needed_bytes,
     stored_in_hdf,
 )
-from ast_sim.importers.formats.frd_results import read_frd_headers
+from ast_sim.importers.formats.frd_results import given_up, read_frd_headers
 from ast_sim.importers.formats.source_mesh import SourceMesh
 from ast_sim.importers.formats.together import labels_of, together
 from ast_sim.importers.formats.vtk_cells import blocks_of
@@ -81,8 +82,22 @@ def vtk_frames(path: Path) -> Iterator[SourceMesh]:
         declared = of_steps[step] if step < len(of_steps) else head.get("declared")
         declared = declared or ([sum(column) for column in zip(*pieces, strict=True)] if pieces else None)
         _require_counts(mesh, declared)
-        yield _without_ghosts(_with_pieces(mesh, pieces, _piece_names(path)))
         step += 1
+        if path.suffix.lower() == ".frd" and step == steps and _is_given_up(path):
+            return
+        yield _without_ghosts(_with_pieces(mesh, pieces, _piece_names(path)))
+
+
+def _is_given_up(path: Path) -> bool:
+    """Whether the last increment of a job did not converge; a warning says that it is left out."""
+    time = given_up(path, read_frd_headers(path)[1])
+    if time is not None:
+        warnings.warn(
+            f"{path}: the job did not converge: the increment at the time {time:g} is the state in which CalculiX gave"
+            " up, and is left out",
+            stacklevel=3,
+        )
+    return time is not None
 
 
 @contextlib.contextmanager
