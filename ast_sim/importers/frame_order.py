@@ -85,6 +85,9 @@ def ordered(files: list[Path], times: list[float | None]) -> tuple[list[int], li
     Args:
         files: in natural order.
         times: what each file says of its time.
+
+    Raises:
+        DatasetError: the files are two series with the same numbers.
     """
     as_named = list(range(len(files)))
     known = [time for time in times if time is not None]
@@ -92,11 +95,33 @@ def ordered(files: list[Path], times: list[float | None]) -> tuple[list[int], li
         order = np.argsort(known, kind="stable").tolist()
         by_name = "the times inside the files, not of their names"
         return order, [] if order == as_named else [_said(files, order, by_name)]
-    if len({tuple(_NUMBER.split(file.stem)[::2]) for file in files}) > 1:
+    if len({_words(file) for file in files}) > 1:
+        _require_one_series(files)
         return as_named, [_said(files, as_named, "their names, which differ in more than a number")]
     whole = sorted(as_named, key=lambda index: _whole_numbers(files[index]))
     by_number = "the numbers in their names, read with their decimal points"
     return as_named, _doubts(files) if whole == as_named else [_said(files, as_named, by_number)]
+
+
+def _words(file: Path) -> tuple[str, ...]:
+    return tuple(_NUMBER.split(file.stem)[::2])
+
+
+def _require_one_series(files: list[Path]) -> None:
+    """Check that files whose names differ in words are not two series that count alike, such as the parts of a model
+    that Kratos writes beside the whole: Structure_0_1, Structure_0_2, Parts_0_1, Parts_0_2."""
+    series: dict[tuple[str, ...], list[tuple[str, ...]]] = {}
+    for file in files:
+        series.setdefault(_words(file), []).append(tuple(_NUMBER.split(file.stem)[1::2]))
+    first: dict[tuple[tuple[str, ...], ...], tuple[str, ...]] = {}
+    for words, numbers in series.items():
+        other = first.setdefault(tuple(sorted(numbers)), words)
+        if other is not words and len(numbers) > 1:
+            named = " and ".join("*".join(one) for one in (other, words))
+            raise DatasetError(
+                f"{files[0].parent}: the files {named} have the same numbers and no times: give each series a folder of"
+                " its own, or list the files of the frames in a PVD file"
+            )
 
 
 def _doubts(files: list[Path]) -> list[str]:
