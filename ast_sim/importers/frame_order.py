@@ -5,12 +5,14 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
 
+from ast_sim.importers.formats.together import labels_of
 from ast_sim.importers.frames_in_file import ONE_FRAME, holds_frames
 from ast_sim.support.errors import DatasetError
 
@@ -25,10 +27,12 @@ _Frames = dict[float, list[tuple[FilePart, Path]]]  # by time
 
 
 class FrameFiles(NamedTuple):
-    """The files of a simulation, grouped by frame, and the time of each frame where a PVD file says it."""
+    """The files of a simulation, grouped by frame, the time of each frame where a PVD file says it, and what tells the
+    files of a frame apart, the same for all frames; none if nothing does."""
 
     files: list[list[Path]]
     times: list[float] | None = None
+    labels: Sequence[str] = ()
 
 
 def natural_order(path: Path) -> list[tuple[float, str]]:
@@ -81,6 +85,9 @@ def ordered(files: list[Path], times: list[float | None]) -> tuple[list[int], li
     Args:
         files: in natural order.
         times: what each file says of its time.
+
+    Raises:
+        DatasetError: the files are two series with the same numbers.
     """
     as_named = list(range(len(files)))
     known = [time for time in times if time is not None]
@@ -88,11 +95,33 @@ def ordered(files: list[Path], times: list[float | None]) -> tuple[list[int], li
         order = np.argsort(known, kind="stable").tolist()
         by_name = "the times inside the files, not of their names"
         return order, [] if order == as_named else [_said(files, order, by_name)]
-    if len({tuple(_NUMBER.split(file.stem)[::2]) for file in files}) > 1:
+    if len({_words(file) for file in files}) > 1:
+        _require_one_series(files)
         return as_named, [_said(files, as_named, "their names, which differ in more than a number")]
     whole = sorted(as_named, key=lambda index: _whole_numbers(files[index]))
     by_number = "the numbers in their names, read with their decimal points"
     return as_named, _doubts(files) if whole == as_named else [_said(files, as_named, by_number)]
+
+
+def _words(file: Path) -> tuple[str, ...]:
+    return tuple(_NUMBER.split(file.stem)[::2])
+
+
+def _require_one_series(files: list[Path]) -> None:
+    """Check that files whose names differ in words are not two series that count alike, such as the parts of a model
+    that Kratos writes beside the whole: Structure_0_1, Structure_0_2, Parts_0_1, Parts_0_2."""
+    series: dict[tuple[str, ...], list[tuple[str, ...]]] = {}
+    for file in files:
+        series.setdefault(_words(file), []).append(tuple(_NUMBER.split(file.stem)[1::2]))
+    first: dict[tuple[tuple[str, ...], ...], tuple[str, ...]] = {}
+    for words, numbers in series.items():
+        other = first.setdefault(tuple(sorted(numbers)), words)
+        if other is not words and len(numbers) > 1:
+            named = " and ".join("*".join(one) for one in (other, words))
+            raise DatasetError(
+                f"{files[0].parent}: the files {named} have the same numbers and no times: give each series a folder of"
+                " its own, or list the files of the frames in a PVD file"
+            )
 
 
 def _doubts(files: list[Path]) -> list[str]:
@@ -143,10 +172,8 @@ def _collection(source: Path) -> FrameFiles:
     counts = {len(files) for files in frames.values()}
     if len(counts) > 1:
         raise DatasetError(f"{source}: lists {min(counts)} to {max(counts)} files for a time; must be equally many")
-    if counts != {1}:
-        frames = _parts_in_order(source, frames)
-    ordered_files = [[file for _, file in files] for files in frames.values()]
-    return FrameFiles(ordered_files, list(frames) if len(frames) > 1 else None)
+    files, labels = _parts_in_order(source, frames)
+    return FrameFiles(files, list(frames) if len(frames) > 1 else None, labels if len(labels) > 1 else [])
 
 
 def _part(entry: ElementTree.Element) -> FilePart:
@@ -154,26 +181,26 @@ def _part(entry: ElementTree.Element) -> FilePart:
     return entry.get("group", ""), float(entry.get("part", "0")), entry.get("name", "")
 
 
-def _parts_in_order(
-    source: Path, frames: dict[float, list[tuple[FilePart, Path]]]
-) -> dict[float, list[tuple[FilePart, Path]]]:
-    """The files of each frame in the order of their parts. If the PVD file does not tell the parts apart, the names of
-    the files without their numbers do, if they can."""
+def _parts_in_order(source: Path, frames: _Frames) -> tuple[list[list[Path]], list[str]]:
+    """The files of each frame in the order of their parts, and what tells these apart: what the PVD file says of them,
+    or else the names of the files, if these do."""
     if all(len({part for part, _ in files}) == len(files) for files in frames.values()):
         if len({frozenset(part for part, _ in files) for files in frames.values()}) > 1:
             raise DatasetError(f"{source}: lists other parts for one time than for another")
-        return {time: sorted(files) for time, files in frames.items()}
-    words = {time: {_words(file): one for one in files for file in one[1:]} for time, files in frames.items()}
-    if (
-        any(len(words[time]) < len(files) for time, files in frames.items())
-        or len({*map(frozenset, words.values())}) > 1
-    ):
-        return frames
-    return {time: [of_words[key] for key in sorted(of_words)] for time, of_words in words.items()}
+        first = sorted(part for part, _ in next(iter(frames.values())))
+        return [[file for _, file in sorted(files)] for files in frames.values()], [
+            f"{group} {number:g} {name}".strip() for group, number, name in first
+        ]
+    listed = [[file for _, file in files] for files in frames.values()]
+    labels = [labels_of([str(file) for file in files]) for files in listed]
+    if len({frozenset(label) for label in labels}) > 1 or len(set(labels[0])) < len(labels[0]):
+        return listed, []
+    pairs = [sorted(zip(*both, strict=True), key=_label_order) for both in zip(labels, listed, strict=True)]
+    return [[file for _, file in frame] for frame in pairs], [label for label, _ in pairs[0]]
 
 
-def _words(file: Path) -> tuple[str, ...]:
-    return tuple(_NUMBER.split(file.name)[::2])
+def _label_order(labelled_file: tuple[str, Path]) -> list[tuple[float, str]]:
+    return natural_order(Path(labelled_file[0]))
 
 
 def _series(source: Path) -> FrameFiles:

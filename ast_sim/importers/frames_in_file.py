@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import re
 import tempfile
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
@@ -104,6 +105,9 @@ def _told(error: BaseException, printed: str = "") -> str:
         told = " ".join(f"{printed} {error if str(error) != '1' else ''}".split())
         return told or "meshio cannot read it"
     key = error.args[0] if isinstance(error, KeyError) and error.args else None
+    lacking = re.search(r"object '([^']*)' doesn't exist", str(key))
+    if lacking:
+        return f"meshio looks for {lacking[1]!r} in it, which it does not hold"
     return f"meshio does not know {key}" if key is not None else f"meshio stopped: {' '.join(str(error).split())}"
 
 

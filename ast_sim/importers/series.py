@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ast_sim.importers.formats.source_mesh import SourceMesh
-from ast_sim.importers.formats.together import together
+from ast_sim.importers.formats.together import labelled, together
 from ast_sim.importers.frame_order import frame_files, ordered
 from ast_sim.importers.frames_in_file import frames_in
 from ast_sim.importers.mesh_file import MeshFile, mesh_of, raw_field
@@ -193,7 +193,7 @@ def _read_frames(
             first = frame
             stitching = Stitching(frame)
             place, order, notes = _stress_place(frame, names)
-        frame, said = in_order_of(frame, first)
+        frame, said = in_order_of(frame, first, kept.points[-1] if kept.points else first.points)
         notes += said
         cells = order_of_cells(frame, first)
         if cells is not None and not said and len(notes) < 2:
@@ -214,7 +214,7 @@ def _read_frames(
                 f"{frame.path}: holds 'von_mises', which the first frame lacks: write it into each frame, or into none"
             )
     assert first is not None and stitching is not None
-    files, times = frame_files(source)
+    files, times, _ = frame_files(source)
     if source.is_dir():
         by_time, said = ordered([file for (file,) in files], kept.times)
         kept.reorder(by_time)
@@ -229,9 +229,12 @@ def _read_frames(
 
 def frames(source: Path) -> Iterator[SourceMesh]:
     """The frames of a simulation, one after the other; see `frame_files` for the errors."""
-    for files in frame_files(source).files:
+    of_frames = frame_files(source)
+    for files in of_frames.files:
         if len(files) > 1:
-            yield together([next(frames_in(file)) for file in files])
+            labels = of_frames.labels or [""] * len(files)
+            pairs = zip(files, labels, strict=True)
+            yield together([labelled(next(frames_in(file)), label) for file, label in pairs])
         elif source.is_dir():
             yield next(frames_in(files[0]))
         else:

@@ -113,7 +113,7 @@ def test_keywords_that_change_the_mesh_are_refused_by_name(tmp_path, keyword):
     ("line", "cause"),
     [
         ("*", "a single asterisk; a comment begins with two"),
-        ("* the other half", r"the elements after this line seem to belong to \*ELEMENT in line 20; a comment"),
+        ("* the other half", r"the 14 lines after this one seem to belong to \*ELEMENT in line 20; a comment"),
         ("*ELEMNT, TYPE=C3D4", r"is this \*ELEMENT\?"),
         ("*ELEMENTS, TYPE=C3D4", r"is this \*ELEMENT\?"),
     ],
@@ -124,6 +124,45 @@ def test_elements_behind_a_line_that_is_no_keyword_are_not_lost(tmp_path, line, 
     path.write_text("\n".join([*lines[:30], line, *lines[30:]]) + "\n")
     with pytest.raises(DatasetError, match=rf"deck.inp:31: \*\w*: {cause}"):
         read_mesh(path)
+
+
+LOST = r"deck.inp:\d+: \*\w+: the (\d )?lines? after this one seems? to belong to \*{} in line \d+; a comment"
+
+
+@pytest.mark.parametrize(
+    ("keyword", "lines"),
+    [
+        ("NSET, NSET=A", ("1, 2, 3", "* more", "4, 5, 6")),
+        ("NSET, NSET=A", ("* the clamp", "4, 5, 6")),
+        ("NSET, NSET=A", ("1", "* first", "* second", "4,", "5,")),
+        ("NSET, NSET=A, GENERATE", ("1, 3, 1", "* node set of the top", "4, 6, 1")),
+        ("NSET, NSET=A", ("1", "* and", "all_nodes")),
+        ("ELSET, ELSET=A", ("1, 2", "* elements of the top", "4, 5")),
+        ("BOUNDARY", ("1, 1, 3", "* the other end", "2, 1, 3, 0.5", "all_nodes, ENCASTRE")),
+        ("NODE", ("* nodes of the tool, size=3", "901, 0, 0, 9", "902, 1e-3, 0., .5")),
+    ],
+)
+def test_lines_behind_a_comment_with_one_asterisk_are_not_lost(tmp_path, keyword, lines):
+    path = deck(tmp_path, "*NSET, NSET=ALL_NODES, GENERATE", "1, 18, 1", f"*{keyword}", *lines)
+    with pytest.raises(DatasetError, match=LOST.format(keyword.partition(",")[0])):
+        read_mesh(path)
+
+
+@pytest.mark.parametrize("lines", [("* moved up", "0, 0, 5"), ("0, 0, 5", "* turned", "0, 0, 0, 0, 0, 1, 90")])
+def test_an_instance_behind_a_comment_with_one_asterisk_keeps_its_place(tmp_path, lines):
+    path = tmp_path / "deck.inp"
+    nodes = "1, 0, 0, 0\n2, 1, 0, 0\n3, 0, 1, 0\n4, 0, 0, 1\n*ELEMENT, TYPE=C3D4\n1, 1, 2, 3, 4"
+    part = f"*PART, NAME=A\n*NODE\n{nodes}\n*END PART\n"
+    path.write_text("\n".join([f"{part}*INSTANCE, NAME=C, PART=A", *lines, "*END INSTANCE"]))
+    with pytest.raises(DatasetError, match=LOST.format("INSTANCE")):
+        read_mesh(path)
+
+
+def test_a_comment_with_one_asterisk_before_a_keyword_loses_nothing(tmp_path):
+    path = deck(
+        tmp_path, "*NSET, NSET=A", "1, 2", "* end of the sets", "*BOUNDARY", "1, 1, 3", "*SHELL SECTION, ELSET=B", "1"
+    )
+    assert len(read_mesh(path).groups["A"]) == 2
 
 
 @pytest.mark.parametrize("keyword", ["BOUNDARY", "SPRING", "MEMBRANE SECTION"])

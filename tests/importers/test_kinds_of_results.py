@@ -249,3 +249,13 @@ def test_groups_of_gmsh_2_with_negative_numbers_and_names_of_windows(tmp_path):
     for encoding in ("utf-8", "latin-1"):
         (tmp_path / "mesh.msh").write_bytes(text.encode(encoding))
         assert {name: len(group) for name, group in read_mesh(tmp_path / "mesh.msh").groups.items()} == {"Klötze": 8}
+
+
+def test_what_meshio_misses_in_a_file_is_named(tmp_path):
+    """Gmsh writes MED files without families, which meshio needs."""
+    path = tmp_path / "mesh.med"
+    meshio.Mesh(PAD.rest_position, [("tetra", PAD.elements)]).write(path)
+    with h5py.File(path, "r+") as file:
+        del file["ENS_MAA"]
+    with pytest.raises(DatasetError, match="mesh.med: cannot be read as a mesh: meshio looks for 'ENS_MAA' in it"):
+        read_mesh(path)

@@ -147,3 +147,20 @@ def test_a_series_file_has_a_time_for_each_frame(tmp_path):
     (tmp_path / "r.vtu.series").write_text('{"files": [{"name": "a.vtu", "time": 1}, {"name": "b.vtu", "time": 1}]}')
     with pytest.raises(DatasetError, match=r"each with a time of its own; it has \[1.0, 1.0\]"):
         read_series(tmp_path / "r.vtu.series", NAMES)
+
+
+@pytest.mark.parametrize("numbers", [("_0_1", "_0_2", "_0_10"), ("1", "2")])
+def test_two_series_in_one_folder_are_refused(tmp_path, numbers):
+    """Kratos writes the parts of a model beside the whole: the frames of one series came after the other series."""
+    for name in ("Structure", "Parts"):
+        for frame, number in enumerate(numbers):
+            grid(TWO, places(frame)).save(tmp_path / f"{name}{number}.vtu")
+    told = "the files Parts.* and Structure.* have the same numbers and no times: give each series a folder"
+    with pytest.raises(DatasetError, match=told):
+        read_series(tmp_path, NAMES)
+
+
+def test_names_of_files_may_be_words(tmp_path):
+    for frame, name in enumerate(("at_rest", "loaded_1", "loaded_2")):
+        grid(TWO, places(frame)).save(tmp_path / f"{name}.vtu")
+    require_motion(read_series(tmp_path, NAMES))

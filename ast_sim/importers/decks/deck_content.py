@@ -6,7 +6,6 @@ error that names it. Keywords that say something else (materials, loads, steps) 
 
 from __future__ import annotations
 
-import difflib
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -14,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ast_sim.importers.decks.comment_lines import is_keyword, require_keyword
 from ast_sim.importers.decks.deck_numbers import elements_of, nodes_of, real, tokens, whole
 from ast_sim.importers.decks.element_types import kind_of
 from ast_sim.importers.decks.keyword_lines import Keyword, read_keywords
@@ -38,9 +38,6 @@ _OPTIONS = {
     "SYSTEM": set(),
     **dict.fromkeys(("ENDPART", "ENDASSEMBLY", "ENDINSTANCE"), set()),
 }
-
-# Words that are as alike as ELEMENT and ELEMENTS are taken for slips of the pen.
-_ALIKE = 0.85
 
 # A node or an element: the instance that it belongs to ("" for the scope itself), and its number.
 Members = list[tuple[str, np.ndarray]]
@@ -143,21 +140,13 @@ class _Reader:
             raise keyword.error("is this a short form? Write the whole keyword")
         else:
             self._ignore(keyword)
-        self.before = keyword
+        if keyword.data or is_keyword(keyword.name) or keyword.name in self.handlers:
+            self.before = keyword
 
     def _ignore(self, keyword: Keyword) -> None:
-        """Pass over a keyword, unless its data lines seem to belong to the mesh: after a comment with one asterisk
-        instead of two, the elements of a block would be lost."""
-        if not keyword.name and keyword.data:
-            raise keyword.error("a single asterisk; a comment begins with two")
-        like = difflib.get_close_matches(keyword.name, _OPTIONS, 1, _ALIKE)
-        if like and keyword.data:
-            raise keyword.error(f"is this *{like[0]}?")
-        if self.before is not None and self.before.name == "ELEMENT" and _goes_on(self.before, keyword):
-            raise keyword.error(
-                f"the elements after this line seem to belong to *ELEMENT in line {self.before.line.number}; a comment"
-                " begins with two asterisks"
-            )
+        """Pass over a keyword, unless its data lines seem to belong to the mesh."""
+        sets = (*self.content.node_sets, *self.content.element_sets, *self.deck.root.node_sets)
+        require_keyword(keyword, self.before, _OPTIONS, sets)
         if keyword.name:
             self.deck.ignored[keyword.name] += 1
 
@@ -284,16 +273,6 @@ class _Reader:
             raise DatasetError(f"{keyword.data[0].place}: a data line that belongs to no keyword")
         self.system = None
         self.content = self.deck.root
-
-
-def _goes_on(block: Keyword, other: Keyword) -> bool:
-    """Whether the data lines of another keyword look like further elements of a block: five whole numbers or more, as
-    many in a line, and the first one of each line is of no element of the block."""
-    rows, further = ([tokens(line) for line in keyword.data] for keyword in (block, other))
-    widths = {len(row) for row in rows if len(row) > 4}  # a line of *BOUNDARY has up to four
-    numbers = {row[0] for row in rows if row}
-    alike = (len(row) in widths and row[0] not in numbers and "".join(row).isdigit() for row in further)
-    return bool(further) and all(alike)
 
 
 def _generated(keyword: Keyword) -> np.ndarray:

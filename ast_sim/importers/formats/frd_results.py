@@ -26,6 +26,9 @@ _HEADER = re.compile(
 )
 _NO_NUMBER = re.compile(rb"^ -[12][^\n]*[*dDqQ,;][^\n]*", re.MULTILINE)  # stars: more digits than there is room for
 _MODES = {b"2": "modes of vibration", b"4": "modes of buckling"}
+# A line of the status file beside it: step, increment, attempt (with U: not converged), iterations and the total time.
+_STATUS = re.compile(r"^\s*[0-9]+\s+[0-9]+\s+[0-9]+(?P<failed>U?)\s+[0-9]+\s+(?P<time>[-+.0-9E]+)\s", re.MULTILINE)
+
 _TEXT_WIDTHS = {0: 5, 1: 10}  # of the number of a node, by format
 _BINARY_WIDTHS = {2: 4, 3: 8}  # of a value, by format
 
@@ -111,6 +114,32 @@ def partly_given(path: Path, results: list[FrdResult], nodes: int) -> Iterator[t
         with _opened(path) as content:
             for result in few:
                 yield result, result.nodes(content)
+
+
+def given_up(path: Path, results: list[FrdResult]) -> float | None:
+    """The time of the last increment, if CalculiX gave it up: then its displacements are far from an equilibrium, and
+    the "forces" are what is left over. The status file (.sta) beside the results says so; without one, an increment
+    that has displacements and forces alone, unlike the one before.
+
+    Raises:
+        DatasetError: there is no other increment.
+    """
+    names: dict[float, set[str]] = {}
+    for result in results:
+        names.setdefault(result.time, set()).add(result.name)
+    times = sorted(names)
+    status = path.with_suffix(".sta")
+    lines = list(_STATUS.finditer(status.read_text(errors="replace"))) if status.is_file() else []
+    if not times or (lines and not lines[-1]["failed"]):
+        return None
+    if lines:
+        ended = max([0.0, *(float(line["time"]) for line in lines if not line["failed"])])
+        failed = times[-1] > ended * (1 + 1e-6)
+    else:
+        failed = len(times) > 1 and names[times[-1]] == {"DISP", "FORC"} != names[times[-2]]
+    if failed and len(times) == 1:
+        raise DatasetError(f"{path}: the job did not converge: its only increment is the state in which it gave up")
+    return times[-1] if failed else None
 
 
 def _declared(content: mmap.mmap, key: bytes) -> int:

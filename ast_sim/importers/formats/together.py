@@ -2,12 +2,35 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from ast_sim.importers.formats.source_mesh import SourceMesh
+
+
+def labels_of(files: Sequence[str]) -> list[str]:
+    """What tells the files of one frame apart: the words in their names, or else the numbers that differ; empty texts
+    if their names have not one form."""
+    parts = [re.split(r"([0-9]+)", file.replace("\\", "/")) for file in files]
+    words = [" ".join(part[::2]) for part in parts]
+    if len(set(words)) == len(words):
+        return words
+    if len({len(part) for part in parts}) > 1:
+        return [""] * len(files)
+    differ = [column for column in zip(*parts, strict=True) if len(set(column)) > 1]
+    return [" ".join(label) for label in zip(*differ, strict=True)] or [""] * len(files)
+
+
+def labelled(mesh: SourceMesh, label: str) -> SourceMesh:
+    """A mesh whose pieces have this label before their names."""
+    if not label:
+        return mesh
+    count = 1 if mesh.pieces is None else int(mesh.pieces.max(initial=0)) + 1
+    names = mesh.piece_names or ("",) * count
+    return replace(mesh, piece_names=tuple(f"{label}/{name}" if name else label for name in names))
 
 
 def together(meshes: Sequence[SourceMesh]) -> SourceMesh:

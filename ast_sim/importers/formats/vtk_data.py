@@ -24,16 +24,22 @@ class Block(NamedTuple):
 
 def blocks_of(data: Any, names: tuple[str, ...] = ()) -> list[Block]:
     """The meshes of a data set, one for each block that is there."""
-    from vtkmodules.vtkCommonDataModel import vtkCompositeDataSet, vtkDataSet, vtkMultiBlockDataSet
+    from vtkmodules.vtkCommonDataModel import (
+        vtkCompositeDataSet,
+        vtkDataSet,
+        vtkMultiBlockDataSet,
+        vtkPartitionedDataSetCollection,
+    )
 
     if isinstance(data, vtkDataSet):
         return [Block(data, "/".join(names), names[-1] if "Node Sets" in names[:-1] else "")]
     if not isinstance(data, vtkCompositeDataSet):
         raise Refused(f"holds a {data.GetClassName().removeprefix('vtk') if data is not None else 'nothing'}, no mesh")
     blocks = []
-    if isinstance(data, vtkMultiBlockDataSet):
-        for index in range(data.GetNumberOfBlocks()):
-            held = data.GetBlock(index)
+    if isinstance(data, vtkMultiBlockDataSet | vtkPartitionedDataSetCollection):
+        several = isinstance(data, vtkMultiBlockDataSet)
+        for index in range(data.GetNumberOfBlocks() if several else data.GetNumberOfPartitionedDataSets()):
+            held = data.GetBlock(index) if several else data.GetPartitionedDataSet(index)
             facts = data.GetMetaData(index) if data.HasMetaData(index) else None
             label = (facts.Get(vtkCompositeDataSet.NAME()) if facts is not None else None) or ""
             if held is not None:

@@ -14,6 +14,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import warnings
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -29,9 +30,9 @@ from ast_sim.importers.formats.declared_sizes import (
     needed_bytes,
     stored_in_hdf,
 )
-from ast_sim.importers.formats.frd_results import read_frd_headers
+from ast_sim.importers.formats.frd_results import given_up, read_frd_headers
 from ast_sim.importers.formats.source_mesh import SourceMesh
-from ast_sim.importers.formats.together import together
+from ast_sim.importers.formats.together import labels_of, together
 from ast_sim.importers.formats.vtk_cells import blocks_of
 from ast_sim.support.errors import DatasetError, require
 
@@ -81,8 +82,22 @@ def vtk_frames(path: Path) -> Iterator[SourceMesh]:
         declared = of_steps[step] if step < len(of_steps) else head.get("declared")
         declared = declared or ([sum(column) for column in zip(*pieces, strict=True)] if pieces else None)
         _require_counts(mesh, declared)
-        yield _without_ghosts(_with_pieces(mesh, pieces))
         step += 1
+        if path.suffix.lower() == ".frd" and step == steps and _is_given_up(path):
+            return
+        yield _without_ghosts(_with_pieces(mesh, pieces, _piece_names(path)))
+
+
+def _is_given_up(path: Path) -> bool:
+    """Whether the last increment of a job did not converge; a warning says that it is left out."""
+    time = given_up(path, read_frd_headers(path)[1])
+    if time is not None:
+        warnings.warn(
+            f"{path}: the job did not converge: the increment at the time {time:g} is the state in which CalculiX gave"
+            " up, and is left out",
+            stacklevel=3,
+        )
+    return time is not None
 
 
 @contextlib.contextmanager
@@ -276,11 +291,17 @@ def _named(part: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
     return {name.removeprefix(prefix): values for name, values in part.items() if name.startswith(prefix)}
 
 
-def _with_pieces(mesh: SourceMesh, pieces: list[tuple[int, int]]) -> SourceMesh:
+def _piece_names(path: Path) -> tuple[str, ...]:
+    """What the names of the files of a .pvtu file tell of its pieces, if each file is one."""
+    return tuple(labels_of(declared_in_xml(path).sources)) if path.suffix.lower() == ".pvtu" else ()
+
+
+def _with_pieces(mesh: SourceMesh, pieces: list[tuple[int, int]], names: tuple[str, ...]) -> SourceMesh:
     """VTK has joined the pieces of a file in their order; their sizes say which point belongs to which."""
     if mesh.pieces is not None or sum(count > 0 for count, _ in pieces) < 2:
         return mesh
-    return replace(mesh, pieces=np.repeat(np.arange(len(pieces)), [count for count, _ in pieces]), piece_names=())
+    of_points = np.repeat(np.arange(len(pieces)), [count for count, _ in pieces])
+    return replace(mesh, pieces=of_points, piece_names=names if len(names) == len(pieces) else ())
 
 
 def _without_ghosts(mesh: SourceMesh) -> SourceMesh:

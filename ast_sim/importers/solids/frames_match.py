@@ -7,27 +7,30 @@ from dataclasses import replace
 import numpy as np
 
 from ast_sim.importers.formats.source_mesh import SourceMesh
+from ast_sim.importers.solids.piece_order import rows_by_piece
 from ast_sim.support.errors import DatasetError
 
 # Names of fields by which programs number points, in small letters and without underlines.
 _NUMBERS = ("globalnodeid", "globalids", "globalid", "nodeid", "nodeids", "pointid", "pointids", "id", "ids")
 
 
-def in_order_of(frame: SourceMesh, first: SourceMesh) -> tuple[SourceMesh, list[str]]:
-    """A frame with its points in the order of the first frame, and a note if they stood in another one. The names of
-    blocks say so, or the numbers that the file gives its points, unless the points stand where they stood before.
+def in_order_of(frame: SourceMesh, first: SourceMesh, before: np.ndarray) -> tuple[SourceMesh, list[str]]:
+    """A frame with its points in the order of the first frame, and a note if they stood in another one, unless the
+    points stand where they stood before; see `piece_order`.
+
+    Args:
+        before: [n, 3] the points of another frame, in the order of the first.
 
     Raises:
-        DatasetError: a field numbers the points in another order.
+        DatasetError: a field numbers the points in another order, or nothing tells which piece is which.
     """
     if len(frame.points) != len(first.points) or np.array_equal(frame.points, first.points):
         return frame, []
-    rows = _rows_by_name(frame, first)
-    what = "blocks"
-    if rows is None:
-        rows = _rows_by_number(frame.same_point, first.same_point)
-        what = "points"
-    if rows is None:
+    rows = _rows_by_number(frame.same_point, first.same_point)
+    said = "the points of {} stand in another order"
+    if rows is None and (by_piece := rows_by_piece(frame, first, before)) is not None:
+        rows, said = by_piece
+    if rows is None or np.array_equal(rows, np.arange(len(rows))):
         _require_numbers(frame, first)
         return frame, []
     place = np.argsort(rows)
@@ -41,24 +44,15 @@ def in_order_of(frame: SourceMesh, first: SourceMesh) -> tuple[SourceMesh, list[
         pieces=first.pieces,
         piece_names=first.piece_names,
     )
-    return ordered, [f"the {what} of {frame.path.name} stand in another order: they are reordered as in the first"]
-
-
-def _rows_by_name(frame: SourceMesh, first: SourceMesh) -> np.ndarray | None:
-    """[n]: where the points of the first frame stand in a frame whose blocks have the same names in another order."""
-    names, wanted = frame.piece_names, first.piece_names
-    unique = "" not in names and len(set(names)) == len(names)
-    if names == wanted or not unique or sorted(names) != sorted(wanted) or frame.pieces is None:
-        return None
-    return np.concatenate([np.flatnonzero(frame.pieces == names.index(name)) for name in wanted])
+    return ordered, [f"{said.format(frame.path.name)}: they are reordered as in the first"]
 
 
 def _rows_by_number(numbers: np.ndarray | None, wanted: np.ndarray | None) -> np.ndarray | None:
-    """[n]: where the wanted numbers stand among others; None if they are not the same numbers, or stand alike."""
-    if numbers is None or wanted is None or np.array_equal(numbers, wanted):
+    """[n]: where the wanted numbers stand among others; None if they are not the same numbers, or stand twice."""
+    if numbers is None or wanted is None:
         return None
     mine, theirs = np.argsort(numbers, kind="stable"), np.argsort(wanted, kind="stable")
-    if not np.array_equal(numbers[mine], wanted[theirs]):
+    if not np.array_equal(numbers[mine], wanted[theirs]) or (np.diff(numbers[mine]) == 0).any():
         return None
     rows = np.empty(len(mine), np.int64)
     rows[theirs] = mine
@@ -70,7 +64,8 @@ def _require_numbers(frame: SourceMesh, first: SourceMesh) -> None:
         before = first.point_fields.get(name)
         if before is None or name.lower().replace("_", "") not in _NUMBERS or values.dtype.kind not in "iu":
             continue
-        if len(np.unique(values)) == values.size and _rows_by_number(values.ravel(), before.ravel()) is not None:
+        rows = _rows_by_number(values.ravel(), before.ravel())
+        if rows is not None and not np.array_equal(rows, np.arange(len(rows))):
             raise DatasetError(
                 f"{frame.path}: the field {name!r} numbers the points in another order than in {first.path.name}: write"
                 " the points in one order, or leave the field out"
