@@ -524,7 +524,10 @@ HOSTILE = {
         lambda f: f.attrs.__setitem__("time_step", "x"),
         "attribute time_step is 'x'; must be a float",
     ),
-    "two centres": (lambda f: f.attrs.__setitem__("domain_center", [0.0, 1.0]), "domain_center must be three numbers"),
+    "two centres": (
+        lambda f: f.attrs.__setitem__("domain_center", [0.0, 1.0]),
+        "domain_center must be three finite numbers",
+    ),
     "a generator that is no JSON": (lambda f: f.attrs.__setitem__("generator", "{"), "generator cannot be read"),
     "a generator that is a list": (lambda f: f.attrs.__setitem__("generator", "[]"), "generator must be a JSON object"),
     "an integration unknown": (lambda f: f.attrs.__setitem__("integration", "x"), "integration is 'x'; must be one of"),
