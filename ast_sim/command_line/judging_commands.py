@@ -50,7 +50,7 @@ def add_calibrate(calibrate: Parser) -> None:
 
 def calibrate(args: argparse.Namespace) -> None:
     """Measure on new scenes how far answers are from the truth, so that each has a band."""
-    from ast_sim.inference.promises.calibration import calibrate as measure
+    from ast_sim.inference.calibrate import calibrate as measure
 
     print(measure(open_run(args.run_folder), args.data, args.split).text)
 
