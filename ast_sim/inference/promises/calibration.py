@@ -77,6 +77,23 @@ class Calibration:
                 told += f"\n{quantity}: error at the deepest frame in {100 * KEPT:g} % of scenes: {'; '.join(known)}"
         return told
 
+    def by_quantity(self) -> dict[str, Any]:
+        """The bands and the kept errors in words, by quantity and effort."""
+        bands = {}
+        for quantity, quantiles in self.quantiles.items():
+            added = f"times its size plus {self.typical[quantity]:.3g}"
+            widths = zip(quantiles, self.efforts, strict=True)
+            bands[quantity] = {one.text: f"{width:.3g} {added}" for width, one in widths if math.isfinite(width)}
+        kept = {}
+        for quantity in self.kept.errors:
+            bounds = zip(self.kept.bounds(quantity), self.kept.efforts, strict=True)
+            kept[quantity] = {one.text: percent(bound) for bound, one in bounds if math.isfinite(bound)}
+        return {
+            "scenes": self.scenes,
+            f"band of {100 * LEVEL:g} %": bands,
+            f"largest error in {100 * KEPT:g} % of scenes": kept,
+        }
+
     def to_json(self) -> dict[str, Any]:
         """As `from_json` reads it."""
         familiarity = None if self.familiarity is None else self.familiarity.to_json()
