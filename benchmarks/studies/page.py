@@ -22,15 +22,13 @@ Made by `python -m benchmarks.studies STUDY.toml`; the studies lie in `benchmark
 same scenes, splits, time budget and settings of the training, except where a row names another setting, and except for
 the state noise, which the tables show: a model that is trained on its own rollouts needs less of it.
 
-- **Training.** Each model was trained with several learning rates. The one with the best rollouts of the validation
-  scenes counts. These rollouts also choose the checkpoint. The number of steps is what fits into the budget at the speed
-  of the model. The speeds were measured in turns before the trainings. A row that came later was measured in turns with
-  a row of the study, and got the speed of that row times their ratio. The tables also show how long each training took
-  by the clock, beside other work.
+- **Training.** Each model has the one of several learning rates with the best rollouts of the validation scenes. These
+  rollouts also choose the checkpoint. The number of steps is what fits into the budget at the speed of the model. Speeds
+  were measured in turns before the trainings; for a row that came later, in turns with a row of the study, whose speed
+  is then scaled. The tables also show how long each training took by the clock, beside other work.
 - **Errors** are of the free nodes of the test scenes: root mean squares over coordinates, by sequence (`rmse_sequence`,
   as in the AST paper) or pooled over everything (`rmse_pooled`, as in MeshGraphNets). Each number is the mean over the
-  seeds, with the lowest and the highest in brackets.
-- All models go step by step here (`model.jumps=false`).
+  seeds, with the lowest and the highest in brackets. All models go step by step here (`model.jumps=false`).
 """
 
 AIM = 0.5  # AST's rollout error over the best baseline's; the paper reports 0.38 on deforming_plate
