@@ -23,8 +23,8 @@ same scenes, splits, time budget and settings of the training, except where a ro
 the state noise, which the tables show: a model that is trained on its own rollouts needs less of it.
 
 - **Training.** Each model has the one of several learning rates with the best rollouts of the validation scenes. These
-  rollouts also choose the checkpoint. The number of steps is what fits into the budget at the speed of the model. Speeds
-  were measured in turns before the trainings; for a row that came later, in turns with a row of the study, whose speed
+  rollouts also choose the checkpoint. The number of steps is what fits into the budget at the speed of the model, which
+  was measured in turns before the trainings; for a row that came later, in turns with a row of the study, whose speed
   is then scaled. The tables also show how long each training took by the clock, beside other work.
 - **Errors** are of the free nodes of the test scenes: root mean squares over coordinates, by sequence (`rmse_sequence`,
   as in the AST paper) or pooled over everything (`rmse_pooled`, as in MeshGraphNets). Each number is the mean over the
