@@ -131,8 +131,8 @@ class RigidMotion:
         if not lengths.any():
             return np.array([0.0, 1.0]), corners[:2]
         kept = np.concatenate([[True], lengths > 0])
-        way = np.concatenate([[0.0], np.cumsum(lengths)])[kept]
-        return way / way[-1], corners[kept]
+        travelled = np.concatenate([[0.0], np.cumsum(lengths)])[kept]
+        return travelled / travelled[-1], corners[kept]
 
     def _rotated(self, s: float) -> np.ndarray:
         """R(s) [3, 3]."""

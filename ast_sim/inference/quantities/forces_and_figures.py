@@ -105,8 +105,8 @@ def figures_of(answer: Answer, origin: Sequence[float]) -> list[dict[str, float]
     computed = sorted(number for number in answer.frames if number >= answer.given)
     last_steps = dict(zip(computed, answer.last_steps, strict=False))
     for frame, position in enumerate(answer.position):
-        way = np.linalg.norm((position - scene.rest_position)[scene.prescribed], axis=1)
-        row = {"travel_of_nodes": float(way.max(initial=0.0))}
+        travel = np.linalg.norm((position - scene.rest_position)[scene.prescribed], axis=1)
+        row = {"travel_of_nodes": float(travel.max(initial=0.0))}
         if forces is not None:
             row |= {"reaction": float(np.linalg.norm(forces[frame]))}
             row |= {f"reaction_{axis}": float(force) for axis, force in zip("xyz", forces[frame], strict=True)}
