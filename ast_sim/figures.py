@@ -15,8 +15,6 @@ from typing import Any
 
 from ast_sim.named_field import REACTION
 
-SOLVER_SCENES = 3  # of an evaluation, in which the solver solves the deepest frame, too, unless told otherwise
-
 
 def main_nodes(quantity: str) -> str:
     """Where the errors of a quantity are shown first."""

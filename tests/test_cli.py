@@ -479,12 +479,17 @@ def test_options_with_several_values_may_be_repeated():
 
 
 def test_a_report_is_html_and_its_name_says_so(trained, tmp_path, capsys):
+    from ast_sim import Trade
+    from ast_sim.inference.evaluation.evaluated_run import report_evaluations
     from ast_sim.view.dataset_page import gallery
 
     error = fails(capsys, "report", trained[0], "--out", tmp_path / "rr.pdf")
     assert "rr.pdf: the name of a page must end in .html or .htm" in error
     with pytest.raises(AstSimError, match="must end in"):
         gallery.write(tmp_path / "rr", trained[0])
+    for write in (Trade({}).report, lambda path: report_evaluations(path, [None], "a title")):
+        with pytest.raises(AstSimError, match="must end in"):
+            write(tmp_path / "a folder" / "rr.pdf")
     assert os.listdir(tmp_path) == []
     assert main(["report", str(trained[0]), "--out", str(tmp_path / "RR.HTM")]) == 0
 

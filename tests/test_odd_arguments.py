@@ -3,6 +3,7 @@
 import math
 import os
 import re
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -300,3 +301,14 @@ def test_classes_of_the_errors(run, scene):
         run.predict(scene, PRESS, effort=3)
     with pytest.raises(DatasetError):
         run.predict(scene, "down")
+
+
+def test_a_warning_names_the_line_of_the_caller(run, scene):
+    turned = ast_sim.RigidMotion([(0, 0, -0.045), (0, 0, 0)])  # between two frames
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        run.predict(scene, {1: turned}, num_frames=6, frames=[-1], progress=False)
+        run.predict_motions(scene, [{1: turned}], num_frames=6, frames=[-1], progress=False)
+        ast_sim.Motion.of_bodies(scene, {1: turned}, 6)
+    assert len([one for one in told if "which no frame shows" in str(one.message)]) == 3
+    assert {one.filename for one in told} == {__file__}

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 from ast_sim.command_line.effort_options import effort_of, error_of
-from ast_sim.number_arrays import percent
 from ast_sim.runs import CONFIG, SCOPE
 from ast_sim.support.argument_types import by_name
 from ast_sim.support.disk import output_file
@@ -165,6 +164,7 @@ def _with_answers_in_words(facts: dict[str, Any]) -> dict[str, Any]:
     """The facts; what a run knows of its answers, thousands of numbers, by quantity and effort."""
     from ast_sim.inference.effort import Effort, EffortErrors
     from ast_sim.inference.promises.calibration import Calibration
+    from ast_sim.number_arrays import percent
 
     known = facts.get("answers")
     if not known:

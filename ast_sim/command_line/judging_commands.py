@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from ast_sim.command_line.commands import SPLITS, check_output, open_run
-from ast_sim.figures import SOLVER_SCENES
+from ast_sim.inference.evaluation import SOLVER_SCENES
 from ast_sim.support.argument_types import Parser, add_each, add_out, add_overwrite, at_least, path
 from ast_sim.support.errors import ConfigError
 
@@ -72,9 +72,9 @@ def add_trade(trade: Parser) -> None:
 def trade(args: argparse.Namespace) -> None:
     """Measure what each error costs, by the run, the solver and other runs: a table and a page."""
     from ast_sim import trade as measure
-    from ast_sim.view.page import check_suffix
+    from ast_sim.view.page import page_name
 
-    check_suffix(args.out)
+    page_name(args.out)
     figures = args.out.with_suffix(".json")
     for out in (args.out, figures):
         check_output(args, out, [args.data])
@@ -104,9 +104,9 @@ def add_report(report: Parser) -> None:
 
 def report(args: argparse.Namespace) -> None:
     """Write a page that shows runs (moving scenes, errors), or a dataset."""
-    from ast_sim.view.page import check_suffix
+    from ast_sim.view.page import page_name
 
-    check_suffix(args.out)
+    page_name(args.out)
     check_output(args, args.out, [*args.shown, *filter(None, [args.data])])
     no_runs = (path for path in args.shown if not path.is_dir() and path.suffix != ".ast")
     datasets = [path for path in no_runs if path.is_file() or path.suffix == ".h5"]

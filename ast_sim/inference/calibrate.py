@@ -23,7 +23,7 @@ from ast_sim.runs.scope import spacing_of
 from ast_sim.scene import Trajectory
 from ast_sim.simulate.jobs.fastest_solver import deepest_frame
 from ast_sim.support.argument_checks import require_type
-from ast_sim.support.errors import ConfigError
+from ast_sim.support.errors import ConfigError, warn
 from ast_sim.support.progress import Progress, ShowProgress
 
 FEWEST = math.ceil(LEVEL / (1 - LEVEL) - 1e-9)  # scenes with which the rank of the quantile is at most their number
@@ -69,10 +69,10 @@ def calibrate(
     run.calibration = result
     if left_out:
         told = f"{len(left_out)} scenes lie outside the training or do not move, the first is {left_out[0]}"
-        warnings.warn(f"{told}: they do not count", stacklevel=2)
+        warn(f"{told}: they do not count")
     run.folder.keep_calibration(result.to_json())
     if run.path.is_file():
-        warnings.warn(f"{run.path} is a file, which is not changed: Run.save writes one with the band", stacklevel=2)
+        warn(f"{run.path} is a file, which is not changed: Run.save writes one with the band")
     return result
 
 

@@ -36,6 +36,7 @@ from ast_sim.support.toml_settings import whole
 from ast_sim.trade_figures import Setting, Side, TradeFigures
 from ast_sim.view import trade_page
 from ast_sim.view.files import make_folder
+from ast_sim.view.page import page_name
 
 SCENES = 20
 MESH_SCENES = 3  # in which the mesh's own error is measured
@@ -75,7 +76,7 @@ class Trade:
             AstSimError: the suffix is neither .html nor .htm, or the file cannot be written.
             MissingExtra: plotly is not installed.
         """
-        make_folder(file_name(path, "path").parent)
+        make_folder(page_name(path).parent)
         trade_page.write(path, list(self.by_quantity.values()), title)
 
 

@@ -15,7 +15,6 @@ wanted one: `kept_errors`. Whether a scene is like the calibration scenes: `fami
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -28,6 +27,7 @@ from ast_sim.inference.quantities.band import LEVEL, Band
 from ast_sim.number_arrays import percent
 from ast_sim.runs.scope import LEEWAY, spacing_of
 from ast_sim.scene import Scene
+from ast_sim.support.errors import warn
 
 if TYPE_CHECKING:
     from ast_sim.inference.answer import Answer
@@ -138,7 +138,7 @@ class Calibration:
             return cls.from_json(answers["calibration"])
         except (KeyError, TypeError):
             told = "was calibrated by another version of ast_sim, which does not count: ast-sim calibrate RUN DATA"
-            warnings.warn(f"{path} {told}", stacklevel=3)
+            warn(f"{path} {told}")
             return None
 
     def unlike(self, scene: Scene, notes: Sequence[str]) -> str:
@@ -167,7 +167,7 @@ class Calibration:
         elif math.isinf(self._widths(effort)[DISPLACEMENT]):
             why = f"too many calibration scenes failed with {effort.text}"
         if why:
-            warnings.warn(f"{answer.name}: no band: {why}", stacklevel=4)
+            warn(f"{answer.name}: no band: {why}")
             return {}
         return {quantity: Band(width, self.typical[quantity]) for quantity, width in self._widths(effort).items()}
 
