@@ -6,13 +6,13 @@ from .importers.convert import convert as convert
 from .importers.scene_mesh import read_scene as read_scene
 from .importers.series import FieldNames as FieldNames
 from .inference.answer import Answer as Answer
+from .inference.calibrate import calibrate as calibrate
 from .inference.effort import Effort as Effort
 from .inference.evaluation.evaluated_run import Evaluation as Evaluation
-from .inference.evaluation.trade import Trade as Trade
-from .inference.evaluation.trade import trade as trade
 from .inference.example_run import example_run as example_run
 from .inference.promises.calibration import Calibration as Calibration
-from .inference.promises.calibration import calibrate as calibrate
+from .inference.trade import Trade as Trade
+from .inference.trade import trade as trade
 from .inference.trained_run import Run as Run
 from .material import Material as Material
 from .ops.library import keep_memory as keep_memory

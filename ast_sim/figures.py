@@ -180,7 +180,7 @@ class Figures:
         scenes: each scene.
         errors: over all scenes.
         failures: how many predictions failed.
-        jumps: whether the model predicts each frame from the first one, so that its "one_step" is its rollout.
+        jumps: whether the model predicts each frame from the first one; it has no errors of "one_step" then.
         effort: what follows the first call of such a model: `corrections`, `newton_steps`, `solved`.
         deepest: the deepest frames.
         speedup: the solver's recorded time for all frames over the model's, both on one thread; None: not known.

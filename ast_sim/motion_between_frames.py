@@ -147,9 +147,9 @@ class Course:
         stops, stop = [], self.position[first, self.prescribed]
         for row in range(first + 1, last):
             here, ahead = self.position[row : row + 2, self.prescribed]
-            way, step = here - stop, ahead - here
-            lengths = np.linalg.norm(way, axis=1) * np.linalg.norm(step, axis=1)
-            if (np.einsum("ni,ni->n", way, step) < -ROUNDING * lengths).any():
+            from_stop, step = here - stop, ahead - here
+            lengths = np.linalg.norm(from_stop, axis=1) * np.linalg.norm(step, axis=1)
+            if (np.einsum("ni,ni->n", from_stop, step) < -ROUNDING * lengths).any():
                 stops.append(float(row))
                 stop = here
         return stops

@@ -35,6 +35,18 @@ def real_numbers(name: str, array: str, value: Any, columns: int | None = None) 
     return single
 
 
+def three_numbers(name: str, array: str, value: Any) -> np.ndarray:
+    """A point or the like, three finite numbers of any real type, as [3] float64.
+
+    Raises:
+        DatasetError: these are others; the text names `name` and `array`.
+    """
+    numbers = real_numbers(name, array, value)
+    if numbers.shape != (3,) or not np.isfinite(numbers).all():
+        raise DatasetError(f"{name}: {array} must be three finite numbers, not {np.asarray(value).tolist()}")
+    return np.asarray(value, np.float64)
+
+
 def whole_numbers(name: str, array: str, value: Any, dtype: type) -> np.ndarray:
     """Whole numbers of any type, an array or lists, as an array of the integer type `dtype`.
 

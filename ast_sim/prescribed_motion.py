@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -13,7 +12,7 @@ import numpy as np
 from ast_sim.number_arrays import nodes_of_body, real_numbers
 from ast_sim.scene import Scene
 from ast_sim.support.argument_checks import require_type
-from ast_sim.support.errors import ConfigError
+from ast_sim.support.errors import ConfigError, warn
 from ast_sim.support.toml_settings import whole
 
 Vector = Sequence[float]
@@ -131,8 +130,8 @@ class RigidMotion:
         if not lengths.any():
             return np.array([0.0, 1.0]), corners[:2]
         kept = np.concatenate([[True], lengths > 0])
-        way = np.concatenate([[0.0], np.cumsum(lengths)])[kept]
-        return way / way[-1], corners[kept]
+        travelled = np.concatenate([[0.0], np.cumsum(lengths)])[kept]
+        return travelled / travelled[-1], corners[kept]
 
     def _rotated(self, s: float) -> np.ndarray:
         """R(s) [3, 3]."""
@@ -183,7 +182,7 @@ class Motion:
         position = np.repeat(scene.rest_position[None], frames, axis=0)
         for body, (nodes, motion) in zip(motions, _moved(scene, motions), strict=True):
             for note in motion.notes(f"the motion of body {body}", range(frames), frames - 1):
-                warnings.warn(note, stacklevel=2)
+                warn(note)
             start = scene.rest_position[nodes].astype(np.float64)
             for frame in range(1, frames):
                 position[frame, nodes] = motion.at(frame / (frames - 1), start)

@@ -25,7 +25,7 @@ typedef struct {
   double number;
   int64_t bytes, row_bytes; /* of all elements, and from row to row */
   bool dense;
-  frozen *frozen; /* whose hidden copy `data` is, or where an output is made; held during the call; or NULL */
+  frozen *frozen; /* whose private copy `data` is, or where an output is made; held during the call; or NULL */
   void *secured;  /* or a copy made for this call */
   void *copy;     /* debug: what an input held before the call */
 } argument;
@@ -222,7 +222,7 @@ static const char check_names[] = "offsets index permutation rising scenes segme
 static bool secure(argument *a) {
   if (!a->bytes) return true;
   if ((a->frozen = find_frozen(a->data, a->bytes))) Py_INCREF(a->frozen->owner);
-  void **copy = a->frozen ? &a->frozen->hidden : &a->secured;
+  void **copy = a->frozen ? &a->frozen->copied : &a->secured;
   if (!*copy) {
     if (!(*copy = malloc((size_t)a->bytes))) return PyErr_NoMemory(), false;
     memcpy(*copy, a->data, (size_t)a->bytes);

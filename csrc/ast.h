@@ -74,8 +74,8 @@ typedef struct {
   ast_activation activation;
 } ast_linear;
 
-/* An attention block (attention_block.c): vectors x [Q,W] attend to a context [K,C] with H heads of D channels, and have
- * F hidden units. */
+/* An attention block (attention_block.c): vectors x [Q,W] attend to a context [K,C] with H heads of D channels, and
+ * have F hidden units. */
 typedef struct {
   int64_t B, Q, K, W, C, H, D, F;
   const float *x, *context, *rotations, *context_rotations; /* [Q,W], [K,C]; [Q,D], [K,D] or NULL: cosines and sines */
@@ -232,7 +232,8 @@ typedef struct {
   ast_status (*attention_block_backward)(const ast_attention_block *s, const float *restrict dout,
                                          ast_attention_block_kept kept, ast_attention_block_gradients g);
 
-  /* sum[r] = sum over the edges m into r, in stored order by chains of 256, of messages[m] = LN(W2 relu(z_m) + b2; gamma, beta), where
+  /* sum[r] = sum over the edges m into r, in stored order by chains of 256, of
+   * messages[m] = LN(W2 relu(z_m) + b2; gamma, beta), where
    * z_m = of_senders[s] + of_receivers[r] + A2 relu(A1 e_m + a1), or + e_m without an encoder; 0 without edges.
    * sum [R,F2]; messages [M,F2] or NULL. */
   ast_status (*message)(const ast_message *s, float *restrict sum, float *restrict messages);
@@ -250,14 +251,15 @@ typedef struct {
                                 const float *restrict weight, const float *restrict bias, const float *restrict z,
                                 float *restrict dx, float *restrict dweight, float *restrict dbias);
   /* force [N,3] = -dE/dposition of the energy E = sum_e V (lambda/2 tr(G)^2 + mu G:G), G = (F^T F - I) / 2, added at
-   * each node in the order of node_order, by chains of 256 whose sums are added by halves. An element contributes exactly nothing, whatever its positions, if its Lame
-   * constants are both 0, a rest position is not finite, or its rest volume is no more than rounding. */
+   * each node in the order of node_order, by chains of 256 whose sums are added by halves. An element contributes
+   * exactly nothing, whatever its positions, if its Lame constants are both 0, a rest position is not finite, or its
+   * rest volume is no more than rounding. */
   ast_status (*elastic_forces)(const ast_elastic *s, float *restrict force);
   /* dposition [N,3] = (dforce/dposition) dforce, whose matrix is symmetric: the gradient. */
   ast_status (*elastic_forces_backward)(const ast_elastic *s, const float *restrict dforce, float *restrict dposition);
-  /* out [N,5]: the outward normal at the nearest point of another body of the scene, times 1 - |gap| / radius; then gap /
-   * radius and gap / (0.1 radius), clipped to -1..1. The gap is negative inside the body. 0, 0, 0, 1, 1 if none is
-   * nearer than the radius. Triangles without an area do not count. */
+  /* out [N,5]: the outward normal at the nearest point of another body of the scene, times 1 - |gap| / radius; then
+   * gap / radius and gap / (0.1 radius), clipped to -1..1. The gap is negative inside the body. 0, 0, 0, 1, 1 if none
+   * is nearer than the radius. Triangles without an area do not count. */
   ast_status (*proximity)(const ast_proximity *s, float *restrict out);
   /* rank[n] = the place of a wanted node in an order in which the nodes of each of the elements [E,K] are near each
    * other, or -1 (breadth_first.c). wanted and rank [N]. */

@@ -1,7 +1,7 @@
 /* Attention: out = dropout(softmax(scale Q K^T)) V for each scene and head, without a Tq x Tk array.
  *
  * Keys come in blocks. With x_j the scores of one query against a block, m their running maximum, l the running sum of
-* the weights and o the running sum of the weighted values,
+ * the weights and o the running sum of the weighted values,
  *
  *   m' = max(m, max_j x_j),   p_j = exp(x_j - m'),
  *   l' = l exp(m - m') + sum_j p_j,   o' = o exp(m - m') + sum_j p_j v_j,   and out = o / l at the end.

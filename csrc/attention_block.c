@@ -4,9 +4,9 @@
  *   z = [a, b] = W_1 LN_f(y) + b_1,   h = a . gelu(b),   out = y + W_2 h + b_2
  *
  * It is made of the kernels of its parts, one after another on arrays in scratch memory, so its rows and its gradients
- * have their bits. What it saves is what calls of small kernels cost. A rotation turns each pair of channels (u, w) of a
- * head into (u cos - w sin, w cos + u sin) (Su et al. 2021); its gradient turns them back. The gradients go through the
- * parts in the opposite order; normalized rows are computed again, everything else is read if it was kept.
+ * have their bits. What it saves is what calls of small kernels cost. A rotation turns each pair of channels (u, w) of
+ * a head into (u cos - w sin, w cos + u sin) (Su et al. 2021); its gradient turns them back. The gradients go through
+ * the parts in the opposite order; normalized rows are computed again, everything else is read if it was kept.
  *
  * Memory: rows of x, q, y and the hidden units, and of the context, k and v; backward also their gradients.
  */

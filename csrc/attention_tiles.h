@@ -5,7 +5,8 @@
  * keys in the backward pass, x[query][key]. Every array that a product reads row by row has rows ROW floats apart: a
  * constant, so that a tile needs one pointer for each operand, and no power of two, which would crowd few cache sets.
  * Products add in rising order of the summed index, in every tile alike: a score has the same bits forward and
-* backward. A score is a sum of chains of SCORE_DEPTH products: its error, times its own size, is the error of a weight.
+ * backward. A score is a sum of chains of SCORE_DEPTH products: its error, times its own size, is the error of a
+ * weight.
  *
  * Legend: n keys of a block, D channels of a head; A read by broadcast, B in vectors, C in GEMM_ROWS x 2 vectors of
  * registers.

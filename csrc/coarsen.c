@@ -1,7 +1,7 @@
 /* The coarser levels of an octree, all at once, and which of their cells are neighbours.
  *
-* Level 0 holds the given cells, level j+1 the parents of the cells of level j, the root R one cell a scene. Legend: P a
- * cell, o = 4x+2y+z its octant (the low three bits of its key), d = 4i+2j+k a step of 0 or 1 along each axis.
+ * Level 0 holds the given cells, level j+1 the parents of the cells of level j, the root R one cell a scene. Legend:
+ * P a cell, o = 4x+2y+z its octant (the low three bits of its key), d = 4i+2j+k a step of 0 or 1 along each axis.
  *
  * Cells. Cell i of level 0 starts new cells at levels 1..q, where q is the highest octal digit in which its key differs
  * from the one before it; q = R where a scene starts. Counting each q by chunks tells where the cells of every level

@@ -53,7 +53,7 @@ AST_INLINE void dropout_draw(const dropout *d, vu counter, vu query, vu words[4]
  * [lane][word]. */
 typedef vu dropout_words[DROPOUT_LANES][4];
 
-/* The words of the queries from `query` and the keys from `group` on, a multiple of DROPOUT_KEYS; lanes up to n only. */
+/* The words of the queries from `query` and the keys from `group` on, a multiple of DROPOUT_KEYS; lanes up to n. */
 AST_INLINE void dropout_draw_queries(const dropout *d, int64_t query, int64_t group, int64_t n, dropout_words words) {
   const vu queries = (vu)LANE_INDICES + (uint32_t)query;
   for (int64_t lane = 0; lane < min64(n, DROPOUT_LANES); lane++)

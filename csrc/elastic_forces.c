@@ -18,7 +18,8 @@
  * N nodes, E elements. About 350 operations an element forward, 80 of them in double, and 530 in a direction, on 4 x 24
  * bytes of coordinates: arithmetic is the limit. VW elements are computed at once: their corners are transposed into
  * one vector per coordinate, and the forces back into 16 floats per element. Then each node adds the forces of its
- * corners in stored order, by chains whose sums are added by halves, so that the result depends on neither threads nor batch.
+ * corners in stored order, by chains whose sums are added by halves, so that the result depends on neither threads
+ * nor batch.
  */
 #include "ast.h"
 #include "simd.h"

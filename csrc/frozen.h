@@ -2,11 +2,11 @@
  *
  * A kernel reads wherever an index points, and another thread may write to a tensor between the check and the kernel.
  * So a kernel reads integers only from memory that Python cannot reach. The tensor that Python gets lies over the
- * memory that is shown; the first kernel to read it makes a hidden copy, and all kernels read that. torch's ops take
+ * memory that is shown; the first kernel to read it makes a private copy, and all kernels read that. torch's ops take
  * tensors and nothing else: the address of the shown memory says which block a tensor belongs to, through autograd and
  * views alike. The block lives as long as its storage, so no other tensor has that address meanwhile. Checks that the
- * hidden copy passed are kept in the block. Integers that are not frozen are copied in every call (arguments.h). All of
- * it happens under the interpreter's lock. Included by arguments.h alone.
+ * private copy passed are kept in the block. Integers that are not frozen are copied in every call (arguments.h). All
+ * of it happens under the interpreter's lock. Included by arguments.h alone.
  */
 #ifndef AST_FROZEN_H
 #define AST_FROZEN_H
@@ -23,7 +23,7 @@ typedef struct {
 typedef struct frozen {
   struct frozen *next;  /* in its bucket */
   PyObject *owner;      /* the capsule that frees this block */
-  void *shown, *hidden; /* hidden: NULL before a kernel reads it */
+  void *shown, *copied; /* copied: NULL before a kernel reads it */
   int64_t bytes, number;
   fact facts[MAX_FACTS];
   int num_facts; /* the newest MAX_FACTS are kept */
@@ -44,7 +44,7 @@ static void forget(PyObject *capsule) {
   frozen *f = PyCapsule_GetPointer(capsule, NULL), **link = bucket_of(f->shown);
   while (*link != f) link = &(*link)->next;
   *link = f->next;
-  free(f->hidden);
+  free(f->copied);
   free(f);
 }
 

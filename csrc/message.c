@@ -9,9 +9,9 @@
  *
  * Edges are sorted by receiver. A task owns a range of receivers with about the same number of edges as any other and
  * goes through them in tiles of MESSAGE_TILE edges, whose h, x and y stay in the second-level cache; while it
- * multiplies, it fetches the rows of P of the next tile. Sums run in stored order, by chains of MESSAGE_CHAIN edges of a
- * receiver, and a row of a product does not depend on its neighbours in a tile, so neither tiles, tasks,
- * threads nor other scenes of a batch change a bit.
+ * multiplies, it fetches the rows of P of the next tile. Sums run in stored order, by chains of MESSAGE_CHAIN edges of
+ * a receiver, and a row of a product does not depend on its neighbours in a tile, so neither tiles, tasks, threads nor
+ * other scenes of a batch change a bit.
  *
  * Cost per edge: 2 (E H + H F + F F2) flops, a row of P read from anywhere in memory, rows of e, of Q and of the sum in
  * order. Memory: 3 tiles a thread and the packed weights.

@@ -274,7 +274,7 @@ static dense_chunks dense_cut(int64_t M, int64_t floats) {
 
 /* One of the gradients that are sums over rows: to [rows,n], or NULL if it is not wanted. Each chunk has a partial sum
  * of it, `at` in the memory of the chunk, rows of whole vectors `row` floats apart. Blocks add to vectors; to matrices
-* only the blocks behind the first one, which sets them. */
+ * only the blocks behind the first one, which sets them. */
 typedef struct {
   float *to;
   int64_t rows, n, at, row;

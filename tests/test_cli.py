@@ -1,6 +1,5 @@
 """The command line: every command on real files, and every kind of bad input as one line and exit code 2."""
 
-import inspect
 import json
 import os
 import re
@@ -17,7 +16,6 @@ from data_samples import sign
 
 from ast_sim.cli import build_parser, main
 from ast_sim.dataset.reader import Dataset
-from ast_sim.inference.trained_run import Run
 from ast_sim.support.errors import AstSimError
 from ast_sim.support.toml_settings import settings
 from ast_sim.training.configure import configure
@@ -63,11 +61,6 @@ def test_help_lists_every_command_and_imports_no_torch():
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     for name in ("demo", "generate", "convert", "info", "train", "predict", "evaluate", "report"):
         assert f"\n    {name} " in found.stdout
-
-
-def test_an_evaluation_has_one_default_number_of_scenes_for_the_solver():
-    arguments = build_parser().parse_args(["evaluate", "run", "data.h5"])
-    assert arguments.solver_scenes == inspect.signature(Run.evaluate).parameters["solver_scenes"].default == 3
 
 
 def test_train_help_explains_every_setting(capsys):
@@ -486,12 +479,17 @@ def test_options_with_several_values_may_be_repeated():
 
 
 def test_a_report_is_html_and_its_name_says_so(trained, tmp_path, capsys):
+    from ast_sim import Trade
+    from ast_sim.inference.evaluation.evaluated_run import report_evaluations
     from ast_sim.view.dataset_page import gallery
 
     error = fails(capsys, "report", trained[0], "--out", tmp_path / "rr.pdf")
     assert "rr.pdf: the name of a page must end in .html or .htm" in error
     with pytest.raises(AstSimError, match="must end in"):
         gallery.write(tmp_path / "rr", trained[0])
+    for write in (Trade({}).report, lambda path: report_evaluations(path, [None], "a title")):
+        with pytest.raises(AstSimError, match="must end in"):
+            write(tmp_path / "a folder" / "rr.pdf")
     assert os.listdir(tmp_path) == []
     assert main(["report", str(trained[0]), "--out", str(tmp_path / "RR.HTM")]) == 0
 

@@ -221,6 +221,15 @@ def test_texts_name_the_noun():
     assert not bad, "say the noun, or the term of the field"
 
 
+def test_lines_of_the_core_are_short():
+    """The formatter leaves comments alone, for the sake of the formulas in them."""
+    sources = [path for path in (REPOSITORY / "csrc").rglob("*") if path.suffix in (".c", ".h")]
+    assert len(sources) > 80
+    texts = {path.relative_to(REPOSITORY).as_posix(): path.read_text(encoding="utf-8") for path in sources}
+    lines = ((path, *line) for path, text in texts.items() for line in enumerate(text.splitlines(), 1))
+    assert not [f"{path}:{number}" for path, number, line in lines if len(line) > 120 or line.startswith("*")]
+
+
 if __name__ == "__main__":
     rooms = Counter()
     for path in MODULE_FILES:

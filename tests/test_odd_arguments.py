@@ -3,6 +3,7 @@
 import math
 import os
 import re
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -169,7 +170,8 @@ def test_files_that_have_no_name(run, scene, data, answer, tmp_path):
         (lambda: Motion.of_bodies(Scene.of(POINTS, CELLS), PRESS, 2.5), "frames is 2.5; it must be a whole number"),
         (lambda: ast_sim.box((0, 0, 0), (1, 1, 1), 2), "cells is 2; it must be a list of three numbers"),
         (lambda: ast_sim.box((0, 0, 0), (1, 1, 1), (2, 2)), "the box has [2, 2] cells; must be three whole numbers"),
-        (lambda: ast_sim.box((0, 0, 0), (1, 1), (2, 2, 2)), "high of the box must be three finite numbers"),
+        (lambda: ast_sim.box((0, 0, 0), (1, 1), (2, 2, 2)), "the box: high must be three finite numbers, not [1, 1]"),
+        (lambda: ast_sim.ball((0, 0, math.inf), 1, 4), "the ball: center must be three finite numbers"),
         (lambda: ast_sim.box("a", "b", (2, 2, 2)), "the box: low must be numbers"),
         (lambda: ast_sim.box((0, 0, 0), (1, 1, 1), (True, True, True)), "cells; must be three whole numbers"),
         (lambda: ast_sim.ball((0, 0, 0), 1, 4.0), "the ball has [4.0] cells; must be an even whole number"),
@@ -224,7 +226,9 @@ def test_a_dataset_of_what_it_cannot_hold(tmp_path):
         ({"family": 5}, "family is 5; must be a text"),
         ({"generator": "me"}, "generator is 'me'; must be facts by name"),
         ({"contact_radius": "a"}, "contact_radius must be numbers"),
-        ({"domain_center": 5}, "domain_center must be three numbers"),
+        ({"domain_center": 5}, "domain_center must be three finite numbers, not 5"),
+        ({"time_step": (1, 2)}, "time_step must be one finite number"),
+        ({"domain_half_width": math.inf}, "domain_half_width must be one finite number, not inf"),
     ):
         refused(lambda changes=changes: write(facts=replace(info, **changes)), text)
     refused(lambda: write(facts=None), "info is None; it must be a DatasetInfo")
@@ -247,7 +251,7 @@ def test_questions_to_an_answer(answer, scene, tmp_path):
     refused(lambda: answer.errors(scene), "truth is of the type Scene; it must be a Trajectory")
     refused(lambda: answer.save(tmp_path / "a.csv", 5), "truth is 5; it must be a Trajectory")
     for origin in (5, (0, 0), (math.nan, 0, 0)):
-        refused(lambda origin=origin: answer.figures(origin), "the origin must be three finite numbers")
+        refused(lambda origin=origin: answer.figures(origin), "origin must be three finite numbers")
 
 
 def test_errors_beside_a_truth_of_another_motion_are_not_written(answer, tmp_path):
@@ -297,3 +301,14 @@ def test_classes_of_the_errors(run, scene):
         run.predict(scene, PRESS, effort=3)
     with pytest.raises(DatasetError):
         run.predict(scene, "down")
+
+
+def test_a_warning_names_the_line_of_the_caller(run, scene):
+    turned = ast_sim.RigidMotion([(0, 0, -0.045), (0, 0, 0)])  # between two frames
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        run.predict(scene, {1: turned}, num_frames=6, frames=[-1], progress=False)
+        run.predict_motions(scene, [{1: turned}], num_frames=6, frames=[-1], progress=False)
+        ast_sim.Motion.of_bodies(scene, {1: turned}, 6)
+    assert len([one for one in told if "which no frame shows" in str(one.message)]) == 3
+    assert {one.filename for one in told} == {__file__}

@@ -73,10 +73,10 @@ def rigid_motion(before: np.ndarray, after: np.ndarray) -> tuple[np.ndarray, np.
 
     The rotation is the best one in the sense of least squares (Kabsch 1976).
     """
-    way = after - before
-    allowed = RIGID * np.abs(way).max()
-    if np.abs(way - way.mean(axis=0)).max() <= allowed:
-        return np.eye(3), way.mean(axis=0)
+    displacement = after - before
+    allowed = RIGID * np.abs(displacement).max()
+    if np.abs(displacement - displacement.mean(axis=0)).max() <= allowed:
+        return np.eye(3), displacement.mean(axis=0)
     center, center_after = before.mean(axis=0), after.mean(axis=0)
     left, extents, right = np.linalg.svd((before - center).T @ (after - center_after))
     if extents[1] <= PLANAR * extents[0]:
@@ -113,8 +113,8 @@ def harmonic_extension(scene: Scene, held: np.ndarray, free: np.ndarray) -> Call
     solve = solve or _solver_of_sparse(diagonal, *upper)
     pulled, pulling, strength = low[outer], high[outer] - count, integrals[outer]
 
-    def extend(way: np.ndarray) -> np.ndarray:
-        pull = [np.bincount(pulled, strength * component[pulling], minlength=count) for component in way.T]
+    def extend(displacement: np.ndarray) -> np.ndarray:
+        pull = [np.bincount(pulled, strength * component[pulling], minlength=count) for component in displacement.T]
         return solve(-np.stack(pull).T)[place]
 
     return extend

@@ -98,14 +98,14 @@ class JumpPool(TrainingPool):
     def _start(self, index: int, first: bool, generator: np.random.Generator) -> _Guess:
         earliest = self._sampler.first_frame
         frame = int(generator.integers(earliest + 1, self._sampler.last_frame(index) + 1))
-        way = [self._sampler.source(index, frame), frame]
+        path = [self._sampler.source(index, frame), frame]
         if generator.random() < ELSEWHERE:
-            way[0] = int(generator.integers(way[0], frame))
-        elif way[0] > earliest and generator.random() < OWN:
-            way.insert(0, self._sampler.source(index, way[0]))
+            path[0] = int(generator.integers(path[0], frame))
+        elif path[0] > earliest and generator.random() < OWN:
+            path.insert(0, self._sampler.source(index, path[0]))
         last = int(generator.integers(1, self._calls + 1)) if first else self._calls
         placement = self._sampler.random_placement(index, generator)
-        return _Guess(index, way[0], way[1], placement, last=last, then=way[2] if len(way) > 2 else None)
+        return _Guess(index, path[0], path[1], placement, last=last, then=path[2] if len(path) > 2 else None)
 
     def _goes_on(self, scene: _Guess, error: np.ndarray) -> bool:
         scene.call, scene.error = scene.call + 1, error

@@ -155,9 +155,29 @@ def info(args: argparse.Namespace) -> None:
         facts = open_run(args.path).describe()
     else:
         facts = describe_dataset(args.path)
-    print(json.dumps(facts, indent=1) if args.json else text(facts))
+    print(json.dumps(facts, indent=1) if args.json else text(_with_answers_in_words(facts)))
     if args.strict and facts.get("looks_wrong"):
         raise DatasetError(f"{args.path}: {len(facts['looks_wrong'])} things look wrong in it")
+
+
+def _with_answers_in_words(facts: dict[str, Any]) -> dict[str, Any]:
+    """The facts; what a run knows of its answers, thousands of numbers, by quantity and effort."""
+    from ast_sim.inference.effort import Effort, EffortErrors
+    from ast_sim.inference.promises.calibration import Calibration
+    from ast_sim.number_arrays import percent
+
+    known = facts.get("answers")
+    if not known:
+        return facts
+    calibration = Calibration.of_run(Path(facts["path"]), known)
+    measured = [EffortErrors.from_json(one) for one in known.get("valid_by_effort", ())]
+    errors = {one.effort.text: percent(one.error) for one in measured if one.error is not None}
+    answers = {
+        "effort": Effort(**known["effort"]).text if "effort" in known else None,
+        "mean error of the displacement": errors,
+        "calibration": None if calibration is None else calibration.by_quantity(),
+    }
+    return {**facts, "answers": answers}
 
 
 def train(args: argparse.Namespace) -> None:

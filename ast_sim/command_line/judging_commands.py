@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from ast_sim.command_line.commands import SPLITS, check_output, open_run
+from ast_sim.inference.evaluation import SOLVER_SCENES
 from ast_sim.support.argument_types import Parser, add_each, add_out, add_overwrite, at_least, path
 from ast_sim.support.errors import ConfigError
 
@@ -19,8 +20,8 @@ def add_evaluate(evaluate: Parser) -> None:
     evaluate.add_argument("run_folder", type=path, metavar="RUN", help="run folder")
     evaluate.add_argument("data", type=path, metavar="DATA", help="dataset")
     evaluate.add_argument("--split", choices=SPLITS, default="test", help="split (default: test)")
-    about = "scenes in which the solver solves the deepest frame, to compare (default: 3; 0: none)"
-    add_each(evaluate, {"--solver-scenes N": about}, type=at_least(0), default=3)
+    about = f"scenes in which the solver solves the deepest frame, to compare (default: {SOLVER_SCENES}; 0: none)"
+    add_each(evaluate, {"--solver-scenes N": about}, type=at_least(0), default=SOLVER_SCENES)
     _add_made_from(evaluate)
     add_out(evaluate, "FILE.json", "also write all figures to this file", required=False)
 
@@ -49,7 +50,7 @@ def add_calibrate(calibrate: Parser) -> None:
 
 def calibrate(args: argparse.Namespace) -> None:
     """Measure on new scenes how far answers are from the truth, so that each has a band."""
-    from ast_sim.inference.promises.calibration import calibrate as measure
+    from ast_sim.inference.calibrate import calibrate as measure
 
     print(measure(open_run(args.run_folder), args.data, args.split).text)
 
@@ -71,9 +72,9 @@ def add_trade(trade: Parser) -> None:
 def trade(args: argparse.Namespace) -> None:
     """Measure what each error costs, by the run, the solver and other runs: a table and a page."""
     from ast_sim import trade as measure
-    from ast_sim.view.page import check_suffix
+    from ast_sim.view.page import page_name
 
-    check_suffix(args.out)
+    page_name(args.out)
     figures = args.out.with_suffix(".json")
     for out in (args.out, figures):
         check_output(args, out, [args.data])
@@ -103,9 +104,9 @@ def add_report(report: Parser) -> None:
 
 def report(args: argparse.Namespace) -> None:
     """Write a page that shows runs (moving scenes, errors), or a dataset."""
-    from ast_sim.view.page import check_suffix
+    from ast_sim.view.page import page_name
 
-    check_suffix(args.out)
+    page_name(args.out)
     check_output(args, args.out, [*args.shown, *filter(None, [args.data])])
     no_runs = (path for path in args.shown if not path.is_dir() and path.suffix != ".ast")
     datasets = [path for path in no_runs if path.is_file() or path.suffix == ".h5"]

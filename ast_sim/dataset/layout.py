@@ -12,7 +12,7 @@ import h5py
 import numpy as np
 
 from ast_sim.material import FRICTION, POISSON, YOUNG, Material
-from ast_sim.number_arrays import real_numbers
+from ast_sim.number_arrays import real_numbers, three_numbers
 from ast_sim.scene import AttributeValue, Scene
 from ast_sim.support.argument_checks import in_short, require_type
 from ast_sim.support.errors import DatasetError
@@ -94,13 +94,11 @@ class DatasetInfo:
             raise DatasetError(f"{name}: family is {in_short(self.family)}; must be a text")
         if not isinstance(self.generator, Mapping):
             raise DatasetError(f"{name}: generator is {in_short(self.generator)}; must be facts by name")
-        center = real_numbers(name, "domain_center", self.domain_center)
-        sizes = ("domain_half_width", "contact_radius", "time_step")
-        numbers = [real_numbers(name, key, getattr(self, key)) for key in sizes]
-        if center.shape != (3,) or any(one.shape for one in numbers):
-            raise DatasetError(f"{name}: domain_center must be three numbers; {', '.join(sizes)} must be one each")
-        if not all(np.isfinite(one).all() for one in (center, *numbers)):
-            raise DatasetError(f"{name}: domain_center, domain_half_width, contact_radius and time_step must be finite")
+        three_numbers(name, "domain_center", self.domain_center)
+        for key in ("domain_half_width", "contact_radius", "time_step"):
+            number = real_numbers(name, key, getattr(self, key))
+            if number.shape or not np.isfinite(number):
+                raise DatasetError(f"{name}: {key} must be one finite number, not {in_short(getattr(self, key))}")
         if self.domain_half_width <= 0 or self.contact_radius < 0 or self.time_step < 0:
             raise DatasetError(f"{name}: domain_half_width must be above 0, contact_radius and time_step at least 0")
 

@@ -113,8 +113,8 @@ class Dataset:
         self.close()
 
     def __reduce__(self) -> tuple[type[Self], tuple[str, str]]:
-        """Another process, such as one of a DataLoader, opens the file for itself."""
-        return type(self), (str(self.path), self.info.length_unit)
+        """Another process, such as one of a DataLoader, opens the file for itself, in whatever folder it works."""
+        return type(self), (str(self.path.absolute()), self.info.length_unit)
 
     def close(self) -> None:
         self._file.close()

@@ -11,7 +11,6 @@ import hashlib
 import json
 import math
 import os
-import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,7 @@ from ast_sim.dataset.layout import SPLITS
 from ast_sim.dataset.reader import Dataset
 from ast_sim.scene import AttributeValue
 from ast_sim.support.disk import write_text
+from ast_sim.support.errors import warn
 
 SUFFIX = "_seconds"
 
@@ -86,7 +86,7 @@ def read_seconds(dataset: Dataset) -> SolverSeconds:
         wrong = _misfit(dataset, samples) if own else "belongs to another dataset"
         if not wrong:
             return SolverSeconds(samples, tuple(processors))
-    warnings.warn(f"{path} {wrong}: the solver's seconds are not known", stacklevel=2)
+    warn(f"{path} {wrong}: the solver's seconds are not known")
     return SolverSeconds()
 
 

@@ -61,8 +61,8 @@ def convert(source: Path | str, out: Path | str, **options: Any) -> dict[str, in
 
 
 def convert_series(
-    source: Path | str,
-    out: Path | str,
+    source: Path,
+    out: Path,
     *,
     names: FieldNames | None = None,
     splits: Splits | None = None,
@@ -101,7 +101,7 @@ def convert_series(
         DatasetError: a file is wrong or lacks something; the text names it. Nothing is written then.
     """
     names = names or FieldNames()
-    series = find_series(source := file_name(source, "source"))
+    series = find_series(source)
     decks = decks_of(source, series, deck, names)
     names = with_units(decks, names, length_unit)
     chosen = _assign(source, list(series), splits, calibration, seed)

@@ -20,7 +20,6 @@ from ast_sim.importers.deepmind_meta import LENGTH, Meta, read_meta
 from ast_sim.importers.tfrecord import count_records, find_values, read_records
 from ast_sim.number_arrays import connected_parts, require_array
 from ast_sim.scene import Scene, Trajectory
-from ast_sim.support.argument_checks import file_name
 from ast_sim.support.errors import DatasetError
 from ast_sim.support.progress import Progress, ShowProgress
 
@@ -42,8 +41,8 @@ def is_deepmind(source: Path) -> bool:
 
 
 def convert_deepmind(
-    source: Path | str,
-    out: Path | str,
+    source: Path,
+    out: Path,
     *,
     splits: Sequence[str] | None = None,
     limit: int | None = None,
@@ -71,7 +70,6 @@ def convert_deepmind(
         DatasetError: a file is wrong or something is missing in it; the text names the file and the record. Nothing is
             written then.
     """
-    source = file_name(source, "source")
     files = _split_files(source, splits)
     meta = read_meta(source / META)
     taken = {"source": str(source), "simulator": meta.simulator, "limit": limit, "every": every}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +18,7 @@ from ast_sim.simulate.families.assembly import scene_of
 from ast_sim.simulate.own_assembly.parameters import Values, completed, recorded
 from ast_sim.simulate.own_assembly.spec_reader import read_spec
 from ast_sim.simulate.own_assembly.standing import reference
-from ast_sim.support.errors import ConfigError
+from ast_sim.support.errors import ConfigError, warn
 from ast_sim.support.toml_settings import require_range, whole
 
 NOT_TRAINED = "the run was not trained on a specification, so it is not known how this one differs from its training"
@@ -94,5 +93,5 @@ def ask(
         motion = Motion(case.prescribed_position.astype(np.float32))
         questions.append(AssemblyQuestion(scene, motion, values, list(shared.origin), told))
     for note in notes:
-        warnings.warn(note, stacklevel=2)
+        warn(note)
     return questions

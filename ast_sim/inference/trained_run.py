@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import os
 import time
-import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -18,6 +17,7 @@ from ast_sim.inference.answer import Answer
 from ast_sim.inference.answering import doubts, in_domain
 from ast_sim.inference.assembly_questions import ask
 from ast_sim.inference.effort import Effort, EffortErrors, error_with
+from ast_sim.inference.evaluation import SOLVER_SCENES
 from ast_sim.inference.evaluation.evaluate import evaluate
 from ast_sim.inference.evaluation.evaluated_run import Evaluation
 from ast_sim.inference.predict_arguments import Motions, new_question, scenes_of
@@ -30,12 +30,12 @@ from ast_sim.runs import run_file
 from ast_sim.scene import Scene, Trajectory
 from ast_sim.simulate.own_assembly.grid import grid, read_table
 from ast_sim.support.argument_checks import file_name, require_bool, several
-from ast_sim.support.errors import ConfigError, RolloutError
+from ast_sim.support.errors import ConfigError, RolloutError, warn
 from ast_sim.support.notebook_table import html_table, one_line
 from ast_sim.support.progress import Progress, ShowProgress
 from ast_sim.support.provenance import provenance
 from ast_sim.support.toml_settings import NOTHING, whole
-from ast_sim.view.page import check_suffix
+from ast_sim.view.page import page_name
 
 
 class Run:
@@ -268,7 +268,7 @@ class Run:
         require_bool(throw=throw)
         for question in questions:
             for note in question.notes:
-                warnings.warn(f"{question.name}: {note}", stacklevel=3)
+                warn(f"{question.name}: {note}")
         answers = in_domain(self.model, questions, effort, progress)
         seconds = (time.perf_counter() - began) / max(1, len(questions))
         told = []
@@ -289,7 +289,7 @@ class Run:
             if answer.failure is not None and throw:
                 raise RolloutError(answer.failure, answer)
             for doubt in (*unlike, *doubts(answer)):
-                warnings.warn(f"{answer.name}: {doubt}", stacklevel=3)
+                warn(f"{answer.name}: {doubt}")
         return told
 
     def expected_error(self, effort: Effort) -> float | None:
@@ -322,7 +322,7 @@ class Run:
         data: str | os.PathLike[str] | Dataset | None = None,
         split: str = "test",
         command: str = "Run.evaluate",
-        solver_scenes: int = 3,
+        solver_scenes: int = SOLVER_SCENES,
         made_from: str | os.PathLike[str] | None = None,
         progress: ShowProgress = True,
     ) -> Evaluation:
@@ -345,5 +345,5 @@ class Run:
 
     def report(self, path: str | os.PathLike[str], data: str | os.PathLike[str] | Dataset | None = None) -> None:
         """Evaluate on the test split and write a page with the results."""
-        check_suffix(path)
-        self.evaluate(data).report(path)
+        page = page_name(path)
+        self.evaluate(data).report(page)

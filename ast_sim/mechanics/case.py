@@ -81,10 +81,10 @@ class SolidCase:
     def farthest(self) -> np.ndarray:
         """[N,3]: where the prescribed nodes are in the frame in which one of them is farthest from its place at rest;
         the last one of several."""
-        way = np.linalg.norm(self.prescribed_position - self.prescribed_position[0], axis=2)[
+        travel = np.linalg.norm(self.prescribed_position - self.prescribed_position[0], axis=2)[
             :, self.scene.prescribed
         ].max(axis=1, initial=0)
-        return self.prescribed_position[len(way) - 1 - int(np.argmax(way[::-1]))]
+        return self.prescribed_position[len(travel) - 1 - int(np.argmax(travel[::-1]))]
 
 
 @dataclass(frozen=True, eq=False)

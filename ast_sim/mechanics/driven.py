@@ -52,12 +52,12 @@ class Driven:
     @staticmethod
     def of(scene: Scene, prescribed_position: np.ndarray) -> Driven:
         """Of a scene with positions [S,N,3] of the prescribed nodes in each frame; other rows are not read."""
-        way = np.where(
+        travel = np.where(
             scene.prescribed, np.abs(prescribed_position - prescribed_position[0]).max(axis=0).max(axis=1), 0
         )
-        farthest = int(np.argmax(way))
+        farthest = int(np.argmax(travel))
         body = int(scene.body[farthest])
-        own, moves = scene.prescribed & (scene.body == body), way > RIGID * way[farthest]
+        own, moves = scene.prescribed & (scene.body == body), travel > RIGID * travel[farthest]
         if scene.node_type[farthest] == NodeType.OBSTACLE or not moves.any():
             nodes = own
         else:

@@ -262,13 +262,13 @@ class NewtonSteps:
         slip = np.concatenate([np.einsum("pi,pi->p", relative, tangent) for tangent in tangents])
         return NearPairs(directions, gaps[movable], slip)
 
-    def _shortened(self, position: np.ndarray, way: np.ndarray) -> np.ndarray:
-        """`position` [N, 3] moved by the largest of 1, 1/2, 1/4, ... of `way` [F] that turns no element over."""
+    def _shortened(self, position: np.ndarray, step: np.ndarray) -> np.ndarray:
+        """`position` [N, 3] moved by the largest of 1, 1/2, 1/4, ... of `step` [F] that turns no element over."""
         share = 1.0
         while True:
             self._shortening = share
             moved = position.ravel().copy()
-            moved[self.system.free] += share * way
+            moved[self.system.free] += share * step
             moved = moved.reshape(-1, 3)
             if share <= SMALLEST or self.elasticity.evaluate(moved).J.min() > 0:
                 return moved

@@ -119,10 +119,10 @@ class Reaction:
             if len(nodes):
                 pairs.append(nodes[KDTree(position[nodes]).query_pairs(self._reach, output_type="ndarray")])
         first, second = np.concatenate(pairs).T
-        way, before = position[second] - position[first], self._rest[second] - self._rest[first]
-        facing = np.einsum("pi,pi->p", outward[first] - outward[second], way) > 0
+        between, before = position[second] - position[first], self._rest[second] - self._rest[first]
+        facing = np.einsum("pi,pi->p", outward[first] - outward[second], between) > 0
         opposite = np.einsum("pi,pi->p", outward[first], outward[second]) < OPPOSITE
-        nearer = np.linalg.norm(way, axis=1) < np.linalg.norm(before, axis=1)
+        nearer = np.linalg.norm(between, axis=1) < np.linalg.norm(before, axis=1)
         return np.stack([first, second])[:, facing & opposite & nearer]
 
     def _outward(self, position: np.ndarray) -> np.ndarray:

@@ -93,7 +93,7 @@ class Kernel:
             return function(*arguments)
         except BufferError:
             try:
-                return function(*map(dense, arguments[: self._num], self._parameters), *arguments[self._num :])
+                return function(*map(contiguous, arguments[: self._num], self._parameters), *arguments[self._num :])
             except ValueError as error:
                 refusal = error
         except ValueError as error:
@@ -147,7 +147,7 @@ class Kernel:
         return tuple([arguments[0].new_empty(0) if x is None else x for x in outputs])
 
 
-def dense(x: Any, p: Argument) -> Any:
+def contiguous(x: Any, p: Argument) -> Any:
     """A tensor aligned and contiguous, but for rows that may lie apart; a copy only if it is not so already."""
     if not isinstance(x, Tensor) or p.shape is None:
         return x

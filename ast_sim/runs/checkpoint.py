@@ -14,7 +14,6 @@ import json
 import os
 import re
 import shutil
-import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,7 +24,7 @@ from safetensors import SafetensorError
 from torch import Tensor
 
 from ast_sim.support.disk import sync_folder, write_synced, write_text
-from ast_sim.support.errors import CheckpointError
+from ast_sim.support.errors import CheckpointError, warn
 from ast_sim.support.toml_settings import NOTHING
 
 FILES = ("model.safetensors", "training.safetensors", "state.json")
@@ -134,7 +133,7 @@ def latest(run_dir: str | os.PathLike[str]) -> Path | None:
         damage = _damage(path)
         if damage is None:
             return path
-        warnings.warn(f"{damage}; using the checkpoint before it", stacklevel=2)
+        warn(f"{damage}; using the checkpoint before it")
     if damage is not None:
         raise CheckpointError(f"{run_dir}: no checkpoint is intact; the oldest one: {damage}")
     return None
@@ -150,7 +149,7 @@ def best(run_dir: str | os.PathLike[str]) -> Path | None:
     damage = None if path is None else _damage(path)
     if damage is None:
         return path
-    warnings.warn(f"the best checkpoint cannot be used: {damage}", stacklevel=2)
+    warn(f"the best checkpoint cannot be used: {damage}")
     return None
 
 

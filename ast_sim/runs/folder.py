@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import warnings
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
@@ -19,7 +18,7 @@ from ast_sim.runs.config_toml import has_config, read_config, read_origin, read_
 from ast_sim.runs.metrics import Metrics
 from ast_sim.runs.scope import Scope
 from ast_sim.runs.train_config import RunConfig
-from ast_sim.support.errors import CheckpointError, ConfigError
+from ast_sim.support.errors import CheckpointError, ConfigError, warn
 
 _ANSWERS = ("effort", "valid_by_effort")  # what a validation records of answers; it is kept beside the best checkpoint
 
@@ -171,7 +170,7 @@ class RunFolder:
         validation = self.metrics.validation(mark.step) if mark else None
         if mark and not validation:
             text = f"{self.metrics.path} misses the validation after step {mark.step}, the best one"
-            warnings.warn(text, stacklevel=2)
+            warn(text)
         return {
             "kind": "run",
             "path": str(self.path),

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import os
 import statistics
-import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from ast_sim.support.disk import write_text
-from ast_sim.support.errors import CheckpointError
+from ast_sim.support.errors import CheckpointError, warn
 from ast_sim.support.sealed_line import seal, unseal
 
 METRICS = "metrics.jsonl"
@@ -43,7 +42,7 @@ class Metrics:
                     damaged.append(f"line {number}: {error}")
         if damaged:
             text = f"{self.path}: {len(damaged)} of {number} lines are damaged and left out, the first is {damaged[0]}"
-            warnings.warn(text, stacklevel=2)
+            warn(text)
 
     def append(self, record: dict[str, Any]) -> None:
         with open(self.path, "a", encoding="utf-8") as file:
@@ -60,7 +59,7 @@ class Metrics:
         count = sum(1 for _ in self)
         if count < lines:
             text = f"{self.path} misses {lines - count} of {lines} lines: its curves are not complete"
-            warnings.warn(text, stacklevel=2)
+            warn(text)
 
     def seconds_per_step(self) -> float | None:
         """The median of the seconds of a training step; None if no step was recorded."""

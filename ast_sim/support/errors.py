@@ -8,10 +8,13 @@ from __future__ import annotations
 
 import difflib
 import importlib
+import sys
+import warnings
 from collections.abc import Iterable
 from types import ModuleType
 from typing import Any
 
+_PACKAGE = __name__.partition(".")[0]
 RESUME = "go on with resume=True (--resume)"  # what to do where a training has stopped
 
 
@@ -57,6 +60,16 @@ class SimulationError(AstSimError):
 
 class MissingExtra(AstSimError, ImportError):
     """An optional dependency that is not installed."""
+
+
+def warn(text: str) -> None:
+    """Warn of something at the line outside this package that led here, the one that its author can change."""
+    level = 2
+    frame = sys._getframe(1)
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] == _PACKAGE:
+        frame = frame.f_back
+        level += 1
+    warnings.warn(text, stacklevel=level)
 
 
 def nearest_name(name: str, known: Iterable[str]) -> str:

@@ -28,7 +28,7 @@ def configure(
     model: str | None = None,
     *,
     config: str | os.PathLike[str] | None = None,
-    from_run: str | os.PathLike[str] | None = None,
+    from_run: Path | None = None,
     changes: Mapping[str, Any] = NOTHING,
 ) -> RunConfig:
     """The settings of a preset or of a run, changed by a file, then by assignments `key=value` and by `changes`, values
@@ -48,7 +48,7 @@ def configure(
     elif model or preset:
         raise ConfigError("a run that starts from another one has its model and settings: leave model and preset out")
     else:
-        source = RunFolder(file_name(from_run, "from_run")).settings
+        source = RunFolder(from_run).settings
         settings = dataclasses.replace(source, train=dataclasses.replace(source.train, minutes=None), data=str(data))
     before = settings
     with _naming(file):

@@ -83,12 +83,11 @@ def train(
     if callback is not None and not callable(callback):
         raise ConfigError(f"callback is {in_short(callback)}; it must be a function of (step, figures)")
     changes = changes_of(state, model_settings, settings)
-    path = path_of(data)
-    chosen = configure(path, preset, (), model, config=config, from_run=from_run, changes=changes)
-    start_training(
-        file_name(out, "out"), chosen, resume=resume, from_run=from_run, callback=callback, progress=progress
-    )
-    return Run(out)
+    folder = file_name(out, "out")
+    source = None if from_run is None else file_name(from_run, "from_run")
+    chosen = configure(path_of(data), preset, (), model, config=config, from_run=source, changes=changes)
+    start_training(folder, chosen, resume=resume, from_run=source, callback=callback, progress=progress)
+    return Run(folder)
 
 
 def new_model(
@@ -122,7 +121,7 @@ def start_training(
     config: RunConfig | None = None,
     resume: bool = False,
     profile_steps: int = 0,
-    from_run: str | os.PathLike[str] | None = None,
+    from_run: Path | None = None,
     callback: Callback | None = None,
     progress: ShowProgress = True,
 ) -> None:
@@ -158,7 +157,7 @@ def start_training(
         wanted = config or saved
         if wanted is None:
             raise TrainingError(f"{run} holds no run to resume: name the dataset to start one")
-        source = None if from_run is None else RunFolder(file_name(from_run, "from_run"))
+        source = None if from_run is None else RunFolder(from_run)
         with Dataset(wanted.data) as dataset:
             scales = measure(dataset)
             fit = partial(resolve, dataset=dataset, scales=scales, keep_model=source is not None)

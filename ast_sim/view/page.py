@@ -25,10 +25,16 @@ SUFFIXES = (".html", ".htm")
 FOOTER = "Made by ast_sim. This page is one file and loads nothing from anywhere."
 
 
-def check_suffix(path: str | os.PathLike[str]) -> None:
-    """Raise AstSimError if the name of a page does not say that it is HTML."""
-    if file_name(path, "path").suffix.lower() not in SUFFIXES:
+def page_name(path: str | os.PathLike[str]) -> Path:
+    """The name of a page as a path.
+
+    Raises:
+        AstSimError: the name does not say that it is HTML.
+    """
+    name = file_name(path, "path")
+    if name.suffix.lower() not in SUFFIXES:
         raise AstSimError(f"{path}: the name of a page must end in {' or '.join(SUFFIXES)}")
+    return name
 
 
 def write(path: str | os.PathLike[str], data: dict[str, Any], title: str) -> None:
@@ -38,8 +44,7 @@ def write(path: str | os.PathLike[str], data: dict[str, Any], title: str) -> Non
         AstSimError: the suffix is neither .html nor .htm, or the file cannot be written.
         MissingExtra: plotly is not installed.
     """
-    path = Path(path)
-    check_suffix(path)
+    path = page_name(path)
     text = render(data, title)
     with explained(path), replacing(path) as temporary:
         # Names of files may hold bytes that are no text; their escapes are valid in JSON, too.

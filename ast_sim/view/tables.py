@@ -76,7 +76,7 @@ def _measure_rows(
 def _measure(
     figures: Figures | None, quantity: str, predictor: str, horizon: str, nodes: str, measure: str
 ) -> float | None:
-    if figures is None or (figures.jumps and predictor == MODEL and horizon == "one_step"):
+    if figures is None:
         return None
     row = figures.error(quantity, predictor, horizon, nodes)
     return None if row is None else getattr(row, measure)

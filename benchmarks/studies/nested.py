@@ -18,7 +18,7 @@ import numpy as np
 
 import ast_sim
 from ast_sim.inference.effort import MOST_NEWTON_STEPS, Effort
-from ast_sim.inference.evaluation.trade import timed_answer
+from ast_sim.inference.trade import timed_answer
 from ast_sim.simulate.jobs.fastest_solver import VARIANTS, solver_outcomes
 from ast_sim.support.provenance import provenance
 from ast_sim.trade_figures import TOLERANCES

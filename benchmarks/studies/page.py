@@ -19,15 +19,16 @@ from benchmarks.svg import axes_of_picture, save
 INTRODUCTION = """# The models compared
 
 Made by `python -m benchmarks.studies STUDY.toml`; the studies lie in `benchmarks/studies`. All runs of a study have the
-same scenes, splits and budget, and the same training but for what is said to be set otherwise; the state noise, of
-which a model that is trained along its own rollouts needs less, stands in the tables. Each model has the learning rate,
-of several, with which its rollouts of the validation scenes are best. Such rollouts also choose the checkpoint that is
-evaluated. A training has as many steps as fit in the budget at the speed of the model. The speeds were measured in
-turns before; rows that came later were measured in turns with a row that was there, and in proportion to its speed.
-What the training then took by the clock, beside other work, is told, too. Errors are measured on the test scenes, on
-nodes that the model moves: root mean squares over coordinates, by sequence (`rmse_sequence`, as in the AST paper) or
-pooled over everything (`rmse_pooled`, as in MeshGraphNets); means over the seeds, with the least and the largest in
-brackets. All models go step by step here (`model.jumps=false`).
+same scenes, splits, time budget and settings of the training, except where a row names another setting, and except for
+the state noise, which the tables show: a model that is trained on its own rollouts needs less of it.
+
+- **Training.** Each model has the one of several learning rates with the best rollouts of the validation scenes. These
+  rollouts also choose the checkpoint. The number of steps is what fits into the budget at the speed of the model, which
+  was measured in turns before the trainings; for a row that came later, in turns with a row of the study, whose speed
+  is then scaled. The tables also show how long each training took by the clock, beside other work.
+- **Errors** are of the free nodes of the test scenes: root mean squares over coordinates, by sequence (`rmse_sequence`,
+  as in the AST paper) or pooled over everything (`rmse_pooled`, as in MeshGraphNets). Each number is the mean over the
+  seeds, with the lowest and the highest in brackets. All models go step by step here (`model.jumps=false`).
 """
 
 AIM = 0.5  # AST's rollout error over the best baseline's; the paper reports 0.38 on deforming_plate

@@ -1,6 +1,6 @@
-/* The formula of an attention block and of its gradients. Included by test_attention_block.c once per type `real` of its
- * arithmetic: as FORMULA in double, the exact values, and in float, whose errors are the measure. Results are out, then
- * the gradients in the order of ast_attention_block_gradients; gradients start at 0. */
+/* The formula of an attention block and of its gradients. Included by test_attention_block.c once per type `real` of
+ * its arithmetic: as FORMULA in double, the exact values, and in float, whose errors are the measure. Results are out,
+ * then the gradients in the order of ast_attention_block_gradients; gradients start at 0. */
 #include <tgmath.h> /* exp, sqrt and others of the type of their argument */
 #undef I            /* of complex.h */
 

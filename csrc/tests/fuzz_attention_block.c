@@ -1,5 +1,5 @@
-/* Fuzzes attention_block and its gradients: a scene alone gives the bits that it gives among others, whatever the others
- * hold, and what is moderate stays finite. */
+/* Fuzzes attention_block and its gradients: a scene alone gives the bits that it gives among others, whatever the
+ * others hold, and what is moderate stays finite. */
 #include "problems.h"
 
 #include "fuzz.h"

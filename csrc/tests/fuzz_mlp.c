@@ -1,5 +1,5 @@
 /* Fuzzes mlp and its gradients: rows alone give the bits that they give among others, absent arrays count as zeros,
-* nothing depends on the rows' strides or on which gradients are wanted, and results agree with the formula in double
+ * nothing depends on the rows' strides or on which gradients are wanted, and results agree with the formula in double
  * within a bound that is computed along with it. */
 #define main tests_of_mlp
 #include "test_mlp.c"

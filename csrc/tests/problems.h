@@ -160,8 +160,8 @@ static ast_elastic new_elastic(int64_t E, float scale) {
 
 /* ---- surfaces of bodies ---- */
 
-/* B scenes of `bodies` balls each, of R rings of R + 2 nodes and two poles, with dents: they touch and overlap. The last
- * node of each scene belongs to no triangle, and the first scene is empty. */
+/* B scenes of `bodies` balls each, of R rings of R + 2 nodes and two poles, with dents: they touch and overlap. The
+ * last node of each scene belongs to no triangle, and the first scene is empty. */
 static ast_proximity new_balls(int64_t B, int64_t bodies, int64_t R, float scale, double radius) {
   const int64_t S = R + 2, per_ball = R * S + 2, faces = 2 * R * S, scenes = B ? B - 1 : 0;
   const int64_t N = scenes * (bodies * per_ball + 1), F = scenes * bodies * faces;

@@ -1,6 +1,6 @@
 /* attention and attention_backward against the formula in double, on every instruction set, serial and on a pool.
  *
-* Accuracy: the largest error is at most twice the error of the formula in plain float plus 1e-6 of the largest value;
+ * Accuracy: the largest error is at most twice the error of the formula in plain float plus 1e-6 of the largest value;
  * four times for scores of 1e4, where the rounding of a few scores is all that counts.
  */
 #include "check.h"

@@ -53,7 +53,7 @@ static mesh new_mesh(int64_t E, int64_t K, int64_t N, uint64_t unwanted) {
   return (mesh){E, K, N, elements, wanted};
 }
 
-/* A row of tetrahedra, numbered at random: nodes of an element are in the same level or the next, of three nodes each. */
+/* A row of tetrahedra, numbered at random: nodes of an element are in one level or the next, of three nodes each. */
 static void test_row(const ast_kernels *kernels) {
   enum { E = 50, N = E + 3 };
   int64_t *elements = new_ints(4 * E), *wanted = new_ints(N), *rank = new_ints(N), number[N];

@@ -1,6 +1,6 @@
 /* linear and linear_backward against the formula in double, on every instruction set, serial and on a pool.
  *
-* Accuracy: the largest error is at most twice the error of the formula in plain float plus 1e-6 of the largest value.
+ * Accuracy: the largest error is at most twice the error of the formula in plain float plus 1e-6 of the largest value.
  */
 #include "check.h"
 

@@ -1,6 +1,6 @@
 /* message and its gradients against the formulas edge by edge, in double.
  *
-* Accuracy: the largest error is at most twice the error of the same loops in float plus 1e-6 of the largest value.
+ * Accuracy: the largest error is at most twice the error of the same loops in float plus 1e-6 of the largest value.
  */
 #include "problems.h"
 

@@ -1,6 +1,6 @@
 /* mlp and mlp_backward against the formula in double, on every instruction set, serial and on a pool.
  *
-* Accuracy: the largest error is at most twice the error of the formula in plain float plus 1e-6 of the largest value.
+ * Accuracy: the largest error is at most twice the error of the formula in plain float plus 1e-6 of the largest value.
  */
 #include "check.h"
 
@@ -124,7 +124,7 @@ static void test_accuracy(const ast_kernels *kernels) {
 
 /* Rows of the LayerNorm that are exact, weight2 being 0: equal values give beta, whatever their size. Nearly equal ones
  * keep their differences, and values whose squares are too large for a float are normalized, too. Plain float is no
-* measure of either: the bound is the rule's, where plain float errs by half a unit in the last place. */
+ * measure of either: the bound is the rule's, where plain float errs by half a unit in the last place. */
 static void test_norm(const ast_kernels *kernels) {
   static const float means[] = {1.1f, 33333.33f, 3.3e7f, 3e38f, 1e20f, 1e-40f};
   static const int64_t channels[] = {1, 7, 48, 64, 128, 131, 300};

@@ -218,7 +218,7 @@ static void one_triangle(const ast_kernels *kernels, const float x[12], double r
 }
 
 /* A triangle that is flat but for the rounding of its corners has no direction that means anything: it does not count.
-* A vector that is no longer than rounding has none either: a node that touches has the normal. */
+ * A vector that is no longer than rounding has none either: a node that touches has the normal. */
 static void test_rounding(const ast_kernels *kernels) {
   const float b[3] = {1, 1.0f / 3, 1.0f / 7};
   float flat[12] = {[11] = 0.5f}, out[5];

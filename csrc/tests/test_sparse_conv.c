@@ -1,6 +1,6 @@
 /* sparse_conv, its transposed form and its weight gradient against three loops in double.
  *
-* Accuracy: the largest error is at most twice the error of the same loops in float plus 1e-6 of the largest value.
+ * Accuracy: the largest error is at most twice the error of the same loops in float plus 1e-6 of the largest value.
  */
 #include "problems.h"
 

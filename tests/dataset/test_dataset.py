@@ -1,6 +1,7 @@
 """The dataset file: exact round trip; whatever is damaged, hostile or full ends in one DatasetError."""
 
 import os
+import pickle
 import random
 import resource
 import signal
@@ -524,7 +525,10 @@ HOSTILE = {
         lambda f: f.attrs.__setitem__("time_step", "x"),
         "attribute time_step is 'x'; must be a float",
     ),
-    "two centres": (lambda f: f.attrs.__setitem__("domain_center", [0.0, 1.0]), "domain_center must be three numbers"),
+    "two centres": (
+        lambda f: f.attrs.__setitem__("domain_center", [0.0, 1.0]),
+        "domain_center must be three finite numbers",
+    ),
     "a generator that is no JSON": (lambda f: f.attrs.__setitem__("generator", "{"), "generator cannot be read"),
     "a generator that is a list": (lambda f: f.attrs.__setitem__("generator", "[]"), "generator must be a JSON object"),
     "an integration unknown": (lambda f: f.attrs.__setitem__("integration", "x"), "integration is 'x'; must be one of"),
@@ -647,3 +651,15 @@ def test_a_closed_dataset_says_that_it_is_closed(tmp_path):
     ):
         with pytest.raises(DatasetError, match=r"d.h5 is closed: open it again with Dataset\(path\)"):
             read()
+
+
+def test_another_process_opens_a_dataset_from_any_folder(tmp_path, monkeypatch):
+    write(tmp_path / "d.h5", some(), stress_location="node")
+    monkeypatch.chdir(tmp_path)
+    with Dataset("d.h5", "mm") as dataset:
+        sent = pickle.dumps(dataset["train"])
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir("elsewhere")
+    received = pickle.loads(sent)[0]
+    assert received.length_unit == "mm"
+    assert np.allclose(received.position, 1000 * some()["train"][0].position, rtol=1e-6)

@@ -9,8 +9,9 @@ import toy
 from scipy.stats import betabinom
 
 import ast_sim
+from ast_sim.inference.calibrate import quantile
 from ast_sim.inference.effort import Effort
-from ast_sim.inference.promises.calibration import Calibration, quantile
+from ast_sim.inference.promises.calibration import Calibration
 from ast_sim.inference.promises.kept_errors import KeptErrors
 from ast_sim.inference.quantities.band import VALUES, Comparison, compared
 from ast_sim.runs import checkpoint

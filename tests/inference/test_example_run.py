@@ -94,3 +94,15 @@ def test_it_says_where_it_comes_from_and_an_unknown_name_is_one_line():
     assert run.effort == ast_sim.Effort(0, 10) and run.scope.family == "deforming_plate"
     with pytest.raises(ConfigError, match="there is no example run 'plate'; did you mean 'plates'"):
         ast_sim.example_run("plate")
+
+
+def test_info_tells_a_calibration_in_words(capsys):
+    """As numbers it is thousands: the errors of all scenes, and the covariance of what the network makes of them."""
+    path = str(ast_sim.example_run("plates").path)
+    assert main(["info", path]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) < 200 and max(map(len, lines)) < 120
+    assert "    band of 95 %" in lines and "    largest error in 90 % of scenes" in lines
+    assert any("up to 1 Newton step " in line and line.endswith(" 1.8 %") for line in lines)
+    assert main(["info", path, "--json"]) == 0
+    assert len(json.loads(capsys.readouterr().out)["answers"]["calibration"]["familiarity"]["scores"]) == 97

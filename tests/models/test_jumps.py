@@ -178,25 +178,31 @@ def test_a_frame_that_fails_keeps_the_others_before_it():
     assert "frame 4 is not finite" in result.failure and result.failure.endswith("the frames before it are kept")
 
 
-def test_the_evaluation_says_that_one_step_is_the_rollout(data):
+def test_a_jump_has_no_error_of_one_step(data):
     with Dataset(data) as dataset:
-        found = evaluate(model_of("transolver"), dataset, effort=Effort(1))
+        jumping = evaluate(model_of("transolver"), dataset, effort=Effort(1))
         stepwise = evaluate(model_of("transolver", jumps=False), dataset)
     for quantity in ("displacement", "stress"):
-        step, whole = (found.error(quantity, horizon=horizon) for horizon in ("one_step", "rollout_all"))
-        assert (step.rmse_sequence, step.rmse_pooled) == (whole.rmse_sequence, whole.rmse_pooled)
-    assert found.jumps is True and stepwise.jumps is False
-    assert "one jump and 1 correction, so" in table(found) and "one jump" not in table(stepwise)
+        assert jumping.error(quantity, horizon="one_step") is None
+        assert stepwise.error(quantity, horizon="one_step").rmse_sequence > 0
+        assert jumping.error(quantity, horizon="rollout_50").rmse_sequence > 0
+    assert jumping.error("displacement", "hold_still", "one_step").rmse_sequence > 0  # beside a run that has steps
+    assert jumping.jumps is True and stepwise.jumps is False
+    assert "one jump and 1 correction: there is no error" in table(jumping) and "one jump" not in table(stepwise)
+    heads = [[line.split() for line in table(one).splitlines() if "rollout_all" in line] for one in (jumping, stepwise)]
+    assert (
+        heads[0] == [["rollout_50", "rollout_all"]] * 3 and heads[1] == [["one_step", "rollout_50", "rollout_all"]] * 3
+    )
 
 
-def test_a_failed_prediction_has_no_one_step(data):
+def test_a_failed_prediction_has_no_error(data):
     model = model_of("ast")
     model.motion_normalizer.scale.fill_(math.nan)
     with Dataset(data) as dataset:
         found = evaluate(model, dataset)
     assert found.failures == 2
     for quantity in ("displacement", "stress"):
-        assert found.error(quantity, horizon="one_step").rmse_sequence is None
+        assert found.error(quantity).rmse_sequence is None
 
 
 @pytest.mark.parametrize("model", ["ast", "transolver"])

@@ -238,7 +238,7 @@ def test_slices_of_columns_are_read_in_place():
     wide = torch.randn(150, 60)
     x, residual, weight = wide[:, 3:20], wide[:, 20:26], torch.randn(6, 40)[:, 9:26]
     for tensor, parameter in zip((x, weight), ops._linear.spec.taken, strict=False):
-        assert library.dense(tensor, parameter) is tensor
+        assert library.contiguous(tensor, parameter) is tensor
     inputs, copies = (x, weight), (x.clone(), weight.clone())
     assert torch.equal(linear(*inputs, residual=residual), linear(*copies, residual=residual.clone()))
     for one in (*inputs, *copies):

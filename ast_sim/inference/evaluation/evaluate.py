@@ -77,7 +77,7 @@ def evaluate(
         name = f"{split}/{index:06d}"
         truth = _truth(dataset, split, index, model.config.data)
         (answer,) = predictions(model, [Question.of(truth, name)], effort)
-        one_step = one_step_predictions(model, truth, name) if scheme.errors_add_up else _predicted(answer)
+        one_step = one_step_predictions(model, truth, name) if scheme.errors_add_up else (None, {})
         errors["displacement"].append(displacement_errors(truth, one_step[0], answer))
         for key, location, *_ in outputs:
             errors[key].append(field_errors(key, location, truth, one_step[1].get(key), answer, constants[key]))
@@ -107,15 +107,6 @@ def _truth(dataset: Dataset, split: str, index: int, data: DataFacts) -> Traject
     truth = dataset.load(split, index, names)
     require_fields(f"{dataset.path}: {split}/{index:06d}", truth.fields, data.fields)
     return truth
-
-
-def _predicted(answer: Answer) -> tuple[np.ndarray | None, dict[str, np.ndarray]]:
-    """The predicted positions and fields of a rollout, without the given frames; none if the rollout failed."""
-    if answer.failure is not None:
-        return None, {}
-    fields = {output: one.values[answer.given :] for output, one in answer.fields.items()}
-    stress = {} if answer.stress is None else {STRESS: answer.stress[answer.given :]}
-    return answer.position[answer.given :], fields | stress
 
 
 def one_step_predictions(model: Simulator, truth: Trajectory, name: str) -> tuple[np.ndarray, dict[str, np.ndarray]]:
@@ -191,8 +182,10 @@ def table(figures: Figures) -> str:
     lines = []
     for quantity, nodes in dict.fromkeys((row.quantity, row.nodes) for row in figures.errors):
         rows = [row for row in figures.errors if (row.quantity, row.nodes) == (quantity, nodes)]
-        horizons = list(dict.fromkeys(row.horizon for row in rows))
-        lines.append(f"{quantity} [{figures.unit(quantity)}], {nodes} nodes: rmse_sequence / rmse_pooled")
+        horizons = [row.horizon for row in rows if row.predictor == "model"]
+        unit = figures.unit(quantity)
+        in_unit = f" [{unit}]" if unit else ""
+        lines.append(f"{quantity}{in_unit}, {nodes} nodes: rmse_sequence / rmse_pooled")
         lines.append(" " * 20 + "".join(f"{horizon:>24}" for horizon in horizons))
         for predictor in dict.fromkeys(row.predictor for row in rows):
             cells = [figures.error(quantity, predictor, horizon, nodes) for horizon in horizons]
@@ -205,7 +198,7 @@ def table(figures: Figures) -> str:
     lines.append(f"scenes: {len(figures.scenes)}, failed: {figures.failures}, threads: {figures.threads}")
     if figures.jumps:
         after = Effort(**figures.effort)
-        lines.append(f"every frame is one jump and {after.text}, so the model's one_step is its rollout")
+        lines.append(f"every frame is one jump and {after.text}: there is no error of one step")
     if all(scene.solver_seconds_per_step is None for scene in figures.scenes):
         lines.append("speed relative to the solver: unknown. Neither the scenes nor a file beside the dataset")
         lines.append("(its name and .seconds.json) hold the seconds of a solver; a dataset is moved together with it")

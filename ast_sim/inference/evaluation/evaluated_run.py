@@ -22,6 +22,7 @@ from ast_sim.support.errors import ConfigError
 from ast_sim.support.notebook_table import html_table, one_line
 from ast_sim.view import report
 from ast_sim.view.files import make_folder
+from ast_sim.view.page import page_name
 
 if TYPE_CHECKING:
     from ast_sim.inference.trained_run import Run
@@ -121,7 +122,7 @@ def report_evaluations(path: str | os.PathLike[str], evaluations: list[Evaluatio
         ConfigError: the runs were evaluated on different scenes, which have the same names.
     """
     _require_one_dataset(evaluations)
-    make_folder(file_name(path, "path").parent)
+    make_folder(page_name(path).parent)
     report.write(path, [evaluation.shown() for evaluation in evaluations], title)
 
 

@@ -6,8 +6,8 @@ the training split); `stress_frame_mean` (the mean of the true frame); of a name
 predictors have the prescribed nodes at their true positions. Stress and fields are compared on the nodes or elements
 that deform (`Scene.deforming`), reactions at the prescribed nodes.
 
-Horizons: `one_step` (each frame is predicted from the true frame before it), `rollout_50` (the first 50 frames of the
-rollout, or all frames if it is shorter), `rollout_all` (all frames).
+Horizons: `one_step` (each frame is predicted from the true frame before it; not of a model that jumps), `rollout_50`
+(the first 50 frames of the rollout, or all frames if it is shorter), `rollout_all` (all frames).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def displacement_errors(truth: Trajectory, one_step: np.ndarray | None, answer: 
     """Errors of the positions on NORMAL nodes and on all nodes. Displacements have the same errors.
 
     Args:
-        one_step: [S - given, N, 3], the model's predictions from the true frames; None if there are none.
+        one_step: [S - given, N, 3], the model's predictions from the true frames; None if it jumps.
         answer: the model's rollout.
     """
     position = truth.position.astype(np.float64)
@@ -90,7 +90,7 @@ def _errors_by_horizon(
     predictors: dict[str, tuple[np.ndarray | None, ...]], target: np.ndarray, rows: dict[str, np.ndarray]
 ) -> Errors:
     """Compare the predictions of each predictor, a pair (one step, rollout) of what broadcasts to the target, with the
-    target [S - given, rows, F]."""
+    target [S - given, rows, F]. Without a step there is no error of it; a rollout that is None has failed."""
     horizons = {"one_step": (0, None), "rollout_50": (1, 50), "rollout_all": (1, None)}
     failed = SquaredError(math.inf, 1)
     return {
@@ -102,6 +102,7 @@ def _errors_by_horizon(
                 for nodes, mask in rows.items()
             }
             for horizon, (which, stop) in horizons.items()
+            if which or predictions[0] is not None
         }
         for predictor, predictions in predictors.items()
     }

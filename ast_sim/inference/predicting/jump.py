@@ -75,7 +75,7 @@ def answer_steps(model: Simulator, questions: Sequence[Question], effort: Effort
     """For each scene the steps to its answer, or a text that says why a frame failed. Arguments and errors as for
     `jumps`."""
     outcomes: list[AnswerSteps | str] = []
-    for scene in _predicted(model, questions, effort, whole_way=True):
+    for scene in _predicted(model, questions, effort, each_step=True):
         if scene.failure is not None:
             outcomes.append(scene.failure)
             continue
@@ -101,9 +101,9 @@ def _predicted(
     questions: Sequence[Question],
     effort: Effort,
     progress: ShowProgress = False,
-    whole_way: bool = False,
+    each_step: bool = False,
 ) -> list[JumpingScene]:
-    """The scenes with their predicted frames. `whole_way`: the stress after each Newton step, and no second start."""
+    """The scenes with their predicted frames. `each_step`: the stress after each Newton step, and no second start."""
     effort.check(model.config)
     for question in questions:
         question.check(model.config.data.given_frames)
@@ -118,8 +118,8 @@ def _predicted(
                 bar.advance(group[-1].name, len(group))
         # In ascending order, whatever the domains: with friction a frame needs to know the one before.
         for frame in frames if effort.newton_steps else ():
-            frame.refine(effort.newton_steps, whole_way, bar)
-            if not whole_way and effort.newton_steps >= MOST_NEWTON_STEPS and frame.unsettled:
+            frame.refine(effort.newton_steps, each_step, bar)
+            if not each_step and effort.newton_steps >= MOST_NEWTON_STEPS and frame.unsettled:
                 _start_again(model, frame, effort, bar)
             if not effort.solved:
                 bar.advance(frame.name)

@@ -73,6 +73,6 @@ def predict_frames(model: Simulator, starts: Sequence[Start], effort: Effort = F
     latents = [None] * len(starts) if first.latent is None else list(first.latent.means().numpy())
     seconds = (time.perf_counter() - began) / len(starts)
     return [
-        PredictedFrame(way, fields, latent, seconds)
-        for *way, fields, latent in zip(*positions, of_starts, latents, strict=True)
+        PredictedFrame(after_each_call, fields, latent, seconds)
+        for *after_each_call, fields, latent in zip(*positions, of_starts, latents, strict=True)
     ]

@@ -68,7 +68,7 @@ class Question:
                 raise RolloutError(f"{self.name} has the frames 0 to {count - 1}; there is no frame {number}")
         wanted = tuple(number % count for number in numbers)
         if not wanted:
-            raise RolloutError(f"{self.name}: name at least one frame")
+            raise RolloutError(f"{self.name} has the frames 0 to {count - 1}: name at least one frame")
         twice = next((number for number in wanted if wanted.count(number) > 1), None)
         if twice is not None:
             raise ConfigError(f"{self.name}: frame {twice} is asked for twice: name each frame once")

@@ -8,42 +8,29 @@ a probability of at least LEVEL, whatever the model is (Vovk, Gammerman, Shafer 
 and for each quantity alone. The calibration scenes must not have trained or chosen the model; so nothing needs to be
 crossed, and n scores are enough from the n on for which the rank is at most n.
 
-What errors the answers keep, and which effort is enough for a wanted one: `kept_errors`. Whether a scene is like the
-calibration scenes: `familiarity`.
+How the scores are measured: `inference/calibrate.py`. What errors the answers keep, and which effort is enough for a
+wanted one: `kept_errors`. Whether a scene is like the calibration scenes: `familiarity`.
 """
 
 from __future__ import annotations
 
 import math
-import os
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, Self
 
-import numpy as np
-
-from ast_sim.inference.effort import Effort, choices
+from ast_sim.inference.effort import Effort
 from ast_sim.inference.promises.familiarity import Familiarity
-from ast_sim.inference.promises.kept_errors import KEPT, KeptErrors
-from ast_sim.inference.quantities.band import LEVEL, Band, Comparison, compared
-from ast_sim.inference.quantities.relative_errors import moves
+from ast_sim.inference.promises.kept_errors import DISPLACEMENT, KEPT, KeptErrors
+from ast_sim.inference.quantities.band import LEVEL, Band
 from ast_sim.number_arrays import percent
 from ast_sim.runs.scope import LEEWAY, spacing_of
-from ast_sim.scene import Scene, Trajectory
-from ast_sim.simulate.jobs.fastest_solver import deepest_frame
-from ast_sim.support.argument_checks import require_type
-from ast_sim.support.errors import ConfigError
-from ast_sim.support.progress import Progress, ShowProgress
+from ast_sim.scene import Scene
+from ast_sim.support.errors import warn
 
 if TYPE_CHECKING:
-    from ast_sim.dataset.reader import Dataset
     from ast_sim.inference.answer import Answer
-    from ast_sim.inference.trained_run import Run
-
-DISPLACEMENT = "displacement"  # the quantity that every scene has
-FEWEST = math.ceil(LEVEL / (1 - LEVEL) - 1e-9)  # scenes with which the rank of the quantile is at most their number
 
 
 @dataclass(frozen=True)
@@ -90,6 +77,23 @@ class Calibration:
                 told += f"\n{quantity}: error at the deepest frame in {100 * KEPT:g} % of scenes: {'; '.join(known)}"
         return told
 
+    def by_quantity(self) -> dict[str, Any]:
+        """The bands and the kept errors in words, by quantity and effort."""
+        bands = {}
+        for quantity, quantiles in self.quantiles.items():
+            added = f"times its size plus {self.typical[quantity]:.3g}"
+            widths = zip(quantiles, self.efforts, strict=True)
+            bands[quantity] = {one.text: f"{width:.3g} {added}" for width, one in widths if math.isfinite(width)}
+        kept = {}
+        for quantity in self.kept.errors:
+            bounds = zip(self.kept.bounds(quantity), self.kept.efforts, strict=True)
+            kept[quantity] = {one.text: percent(bound) for bound, one in bounds if math.isfinite(bound)}
+        return {
+            "scenes": self.scenes,
+            f"band of {100 * LEVEL:g} %": bands,
+            f"largest error in {100 * KEPT:g} % of scenes": kept,
+        }
+
     def to_json(self) -> dict[str, Any]:
         """As `from_json` reads it."""
         familiarity = None if self.familiarity is None else self.familiarity.to_json()
@@ -134,7 +138,7 @@ class Calibration:
             return cls.from_json(answers["calibration"])
         except (KeyError, TypeError):
             told = "was calibrated by another version of ast_sim, which does not count: ast-sim calibrate RUN DATA"
-            warnings.warn(f"{path} {told}", stacklevel=3)
+            warn(f"{path} {told}")
             return None
 
     def unlike(self, scene: Scene, notes: Sequence[str]) -> str:
@@ -163,7 +167,7 @@ class Calibration:
         elif math.isinf(self._widths(effort)[DISPLACEMENT]):
             why = f"too many calibration scenes failed with {effort.text}"
         if why:
-            warnings.warn(f"{answer.name}: no band: {why}", stacklevel=4)
+            warn(f"{answer.name}: no band: {why}")
             return {}
         return {quantity: Band(width, self.typical[quantity]) for quantity, width in self._widths(effort).items()}
 
@@ -171,171 +175,3 @@ class Calibration:
         """The quantile of each quantity."""
         number = self.efforts.index(effort)
         return {quantity: widths[number] for quantity, widths in self.quantiles.items()}
-
-
-def quantile(scores: Sequence[float]) -> float:
-    """The ceil((n + 1) LEVEL)-th smallest of n scores; n is at least `FEWEST`."""
-    return sorted(scores)[math.ceil((len(scores) + 1) * LEVEL - 1e-9) - 1]
-
-
-def calibrate(
-    run: Run,
-    data: str | os.PathLike[str] | Dataset | None = None,
-    split: str = "calibration",
-    *,
-    progress: ShowProgress = True,
-) -> Calibration:
-    """Measure how far the answers of a run are from the truth, after its default effort and each effort among which one
-    is chosen for a wanted error; then answers with these efforts have a band.
-
-    The scenes must be new to the run: they have neither trained nor chosen it. Scenes outside the ranges of the
-    training do not count, since no band is given there; neither do scenes without motion. A warning says how many. The
-    folder of a run keeps the result beside its best checkpoint, and `Run.save` takes it along.
-
-    Args:
-        run: the run. A file is not changed: only this object knows the band, and a file that `run.save` writes of it.
-        data: a dataset, its path or open; by default the one that the run was trained on.
-        split: whose scenes are predicted.
-        progress: as in `generate`.
-
-    Raises:
-        ConfigError: the split has trained or chosen the run, there are fewer than 19 scenes, or too many fail.
-    """
-    require_runs(run)
-    with run.open(data) as dataset:
-        require_new_scenes(run, dataset, split)
-        before, run.calibration = run.calibration, None  # it has no say in which scenes count
-        try:
-            result, left_out = _measured(run, dataset, split, progress)
-        except BaseException:
-            run.calibration = before
-            raise
-    run.calibration = result
-    if left_out:
-        told = f"{len(left_out)} scenes lie outside the training or do not move, the first is {left_out[0]}"
-        warnings.warn(f"{told}: they do not count", stacklevel=2)
-    run.folder.keep_calibration(result.to_json())
-    if run.path.is_file():
-        warnings.warn(f"{run.path} is a file, which is not changed: Run.save writes one with the band", stacklevel=2)
-    return result
-
-
-def require_runs(*runs: Any) -> None:
-    """Raise ConfigError unless these are trained runs."""
-    from ast_sim import Run  # by its public name: it imports this module
-
-    for run in runs:
-        require_type("a run", run, Run, "a Run, such as ast_sim.Run(folder)")
-
-
-def require_new_scenes(run: Run, dataset: Dataset, split: str) -> None:
-    """Raise ConfigError if the scenes of a split have trained or chosen the run. A copy of its dataset is known."""
-    if split in ("train", "valid") and (
-        Path(run.settings.data).resolve() == dataset.path.resolve()
-        or run.folder.origin.get("data") == dataset.fingerprint()
-    ):
-        raise ConfigError(f"the scenes of {split} have trained or chosen the run: take other scenes")
-
-
-class _Measured(NamedTuple):
-    """A calibration scene.
-
-    Attributes:
-        comparisons: of the quantities in all frames, for each effort with a band; None where the prediction failed.
-        errors: of the deepest frame, for each effort among which one is chosen; None where the prediction failed.
-        spacing: as `Calibration` has it.
-        latents: [frames, D]; None: the model does not tell.
-    """
-
-    comparisons: list[dict[str, Comparison] | None]
-    errors: list[dict[str, float] | None]
-    spacing: float
-    latents: np.ndarray | None
-
-
-def _measured(run: Run, dataset: Dataset, split: str, progress: ShowProgress) -> tuple[Calibration, list[str]]:
-    """The calibration by the scenes of a split, and the names of the scenes that do not count."""
-    to_choose = choices(run.settings.model, run.settings.train.corrections)
-    efforts = to_choose if run.effort in to_choose else (*to_choose, run.effort)
-    scenes: list[_Measured] = []
-    left_out: list[str] = []
-    fields = [name for name, *_ in run.settings.model.data.fields]
-    with Progress(dataset.count(split), "scenes", progress) as bar, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # what they tell is counted here
-        for index in range(dataset.count(split)):
-            name = f"{split}/{index:06d}"
-            one = _measured_scene(run, dataset.load(split, index, fields), name, efforts, to_choose)
-            bar.advance(name)
-            if one is None:
-                left_out.append(name)
-            else:
-                scenes.append(one)
-    if len(scenes) < FEWEST:
-        raise ConfigError(
-            f"a band of {100 * LEVEL:g} % needs at least {FEWEST} calibration scenes, and there are {len(scenes)}: make"
-            " more with generate(..., calibration=N) (--calibration N)"
-        )
-    quantiles, typical = _quantiles([one.comparisons for one in scenes])
-    spacings = [one.spacing for one in scenes]
-    latents = [one.latents for one in scenes if one.latents is not None]
-    familiarity = Familiarity.of(latents) if len(latents) >= FEWEST else None
-    kept = _kept_errors(to_choose, [list(of_effort) for of_effort in zip(*(one.errors for one in scenes), strict=True)])
-    reach = (min(spacings), max(spacings))
-    return Calibration(len(scenes), efforts, quantiles, typical, reach, kept, familiarity), left_out
-
-
-def _quantiles(
-    scenes: Sequence[Sequence[Mapping[str, Comparison] | None]],
-) -> tuple[dict[str, tuple[float, ...]], dict[str, float]]:
-    """The quantiles of each quantity, one for each effort, and the typical sizes, from the comparisons by scene.
-
-    Raises:
-        ConfigError: with each effort too many predictions failed.
-    """
-    known = [one for scene in scenes for one in scene if one is not None]
-    quantiles: dict[str, tuple[float, ...]] = {}
-    typical: dict[str, float] = {}
-    for quantity in known[0] if known else ():
-        if not all(quantity in one for one in known):
-            continue
-        sizes = np.concatenate([one[quantity].true_sizes for one in known])
-        typical[quantity] = float(np.sqrt(np.square(sizes).mean()))
-        quantiles[quantity] = tuple(
-            quantile([math.inf if one is None else one[quantity].score(typical[quantity]) for one in of_effort])
-            for of_effort in zip(*scenes, strict=True)
-        )
-    if all(map(math.isinf, quantiles.get(DISPLACEMENT, ()))):
-        failed = min(of_effort.count(None) for of_effort in zip(*scenes, strict=True))
-        raise ConfigError(f"{failed} of {len(scenes)} predictions failed: no band holds")
-    return quantiles, typical
-
-
-def _measured_scene(
-    run: Run, truth: Trajectory, name: str, efforts: Sequence[Effort], to_choose: Sequence[Effort]
-) -> _Measured | None:
-    """A calibration scene; None: nothing moves in it, or it lies outside the training."""
-    if not moves(truth):
-        return None
-    answers = [run.predict(truth, effort=effort, throw=False, name=name, progress=False) for effort in efforts]
-    if answers[0].notes:
-        return None
-    comparisons = [None if one.failure is not None else compared(one, truth) for one in answers]
-    deepest = deepest_frame(truth)
-    alone = [
-        run.predict(truth, frames=deepest, effort=effort, throw=False, name=name, progress=False)
-        for effort in to_choose
-    ]
-    errors = [None if one.failure is not None else one.errors(truth) for one in alone]
-    latents = np.stack(list(answers[0].latents.values())) if answers[0].latents else None
-    return _Measured(comparisons, errors, spacing_of(truth.scene), latents)
-
-
-def _kept_errors(efforts: Sequence[Effort], errors: Sequence[Sequence[Mapping[str, float] | None]]) -> KeptErrors:
-    """The errors by quantity, effort and scene; None, where the prediction failed, is infinite."""
-    known = [one for of_scenes in errors for one in of_scenes if one is not None]
-    shared = [quantity for quantity in (known[0] if known else ()) if all(quantity in one for one in known)]
-    by_quantity = {
-        quantity: tuple(tuple(math.inf if one is None else one[quantity] for one in of_scenes) for of_scenes in errors)
-        for quantity in shared
-    }
-    return KeptErrors(tuple(efforts), by_quantity)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
@@ -10,7 +9,7 @@ from ast_sim.inference.effort import Effort
 from ast_sim.inference.promises.kept_errors import DISPLACEMENT, KEPT, in_words
 from ast_sim.inference.promises.milliseconds import effort_within
 from ast_sim.support.argument_checks import require_type
-from ast_sim.support.errors import ConfigError
+from ast_sim.support.errors import ConfigError, warn
 
 if TYPE_CHECKING:
     from ast_sim.inference.predicting.question import Question
@@ -52,7 +51,7 @@ def _keeping(
     for question in questions:
         why = run.calibration.unlike(question.scene, question.notes)
         if why:
-            warnings.warn(f"{question.name}: no error is promised: {why}", stacklevel=4)
+            warn(f"{question.name}: no error is promised: {why}")
         facts.append({"effort": effort.text} if why else {"effort": effort.text, "promise": promise})
     return effort, facts
 

@@ -23,7 +23,7 @@ from ast_sim.support.errors import ConfigError
 
 KEPT = 0.9  # of the scenes keep the error that was asked for
 FEWEST = math.ceil(1 / (1 - KEPT) - 1e-9) - 1  # scenes, of which none may miss
-DISPLACEMENT = "displacement"  # what an error is of, if nothing is said
+DISPLACEMENT = "displacement"  # the quantity that every scene has; what an error is of, if nothing is said
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from ast_sim.dataset.layout import LENGTH_UNITS
 from ast_sim.mechanics.driven import Driven
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean
 from ast_sim.named_field import REACTION
-from ast_sim.number_arrays import real_numbers
+from ast_sim.number_arrays import three_numbers
 from ast_sim.support.errors import AstSimError, ConfigError, SimulationError
 from ast_sim.view import sweep_files
 from ast_sim.view.files import make_folder
@@ -97,9 +97,7 @@ def write_figures(path: Path, answer: Answer) -> None:
 def figures_of(answer: Answer, origin: Sequence[float]) -> list[dict[str, float]]:
     """See `Answer.figures`."""
     scene, rows = answer.scene, []
-    numbers = real_numbers(answer.name, "origin", origin)
-    if numbers.shape != (3,) or not np.isfinite(numbers).all():
-        raise ConfigError(f"{answer.name}: the origin must be three finite numbers")
+    shift = three_numbers(answer.name, "origin", origin)
     try:
         forces = answer.reaction()
     except ConfigError:  # a figure that this scene has not
@@ -107,8 +105,8 @@ def figures_of(answer: Answer, origin: Sequence[float]) -> list[dict[str, float]
     computed = sorted(number for number in answer.frames if number >= answer.given)
     last_steps = dict(zip(computed, answer.last_steps, strict=False))
     for frame, position in enumerate(answer.position):
-        way = np.linalg.norm((position - scene.rest_position)[scene.prescribed], axis=1)
-        row = {"travel_of_nodes": float(way.max(initial=0.0))}
+        travel = np.linalg.norm((position - scene.rest_position)[scene.prescribed], axis=1)
+        row = {"travel_of_nodes": float(travel.max(initial=0.0))}
         if forces is not None:
             row |= {"reaction": float(np.linalg.norm(forces[frame]))}
             row |= {f"reaction_{axis}": float(force) for axis, force in zip("xyz", forces[frame], strict=True)}
@@ -116,7 +114,7 @@ def figures_of(answer: Answer, origin: Sequence[float]) -> list[dict[str, float]
             stress = answer.stress[frame, :, 0]
             worst = int(np.where(scene.deforming(answer.stress_location or "node"), stress, -np.inf).argmax())
             nodes = scene.elements[worst] if answer.stress_location == "element" else [worst]
-            place = position[nodes].mean(axis=0) + origin
+            place = position[nodes].mean(axis=0) + shift
             row |= {"largest_stress": float(stress[worst])}
             row |= {f"stress_at_{axis}": float(x) for axis, x in zip("xyz", place, strict=True)}
         for name, one in answer.fields.items():

@@ -137,8 +137,8 @@ class Elasticity:
         """Add to the entries [78,E] of each element what makes the negative eigenvalues of d2 psi / dF2 zero."""
         material, J = self.material, deformation.J
         arguments = material.mu, material.pressure_factor(J), material.lam * J * J
-        for elements, way, value in negative_directions(deformation, *arguments, self.gradients):
-            b = way.reshape(12, -1)
+        for elements, direction, value in negative_directions(deformation, *arguments, self.gradients):
+            b = direction.reshape(12, -1)
             # Of all elements: to pick the elements that have any takes twice as long.
             whole = np.zeros((12, entries.shape[1]))
             whole[:, elements] = b * np.sqrt(value * self.volume[elements])

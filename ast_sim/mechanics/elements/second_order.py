@@ -192,8 +192,8 @@ class SecondOrder(Elasticity):
 
     def _lift(self, entries: np.ndarray, negative: Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> None:
         """Add to the entries [E,465] of each element what makes the negative eigenvalues at its points zero."""
-        for points, way, value in negative:
-            b = way.reshape(30, -1)
+        for points, direction, value in negative:
+            b = direction.reshape(30, -1)
             scale = value * self.volume[points]
             for point in range(4):  # an element has only one of each, so the sums below lose nothing
                 at = points // self._count == point

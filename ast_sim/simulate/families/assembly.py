@@ -5,7 +5,6 @@ Lengths are in the unit of the specification. Forces and energies of a trajector
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
@@ -27,7 +26,7 @@ from ast_sim.simulate.own_assembly.rest_check import BadAssembly, check
 from ast_sim.simulate.own_assembly.standing import PlacedPart, Reference, case, placed, reference
 from ast_sim.simulate.shapes.cad.gmsh_process import MeshingFailed
 from ast_sim.simulate.shapes.mesh_check import BadMesh
-from ast_sim.support.errors import ConfigError, SimulationError
+from ast_sim.support.errors import ConfigError, SimulationError, warn
 
 DRAWS = 10  # draws of the parameters before a sample is given up
 MESHES, NODE_TOLERANCE = 4, 0.1  # further meshes, at most, are made to come this near to a wanted number of nodes
@@ -129,7 +128,7 @@ def check_spec(spec: AssemblySpec, nodes: int | None, frames: int, keep: tuple[i
             key = limit.part, limit.kind
             worst[key] = max(limit, worst.get(key, limit), key=lambda one: one.badness)
     for note in [*notes, *(limit.text for limit in worst.values())]:
-        warnings.warn(note, stacklevel=2)
+        warn(note)
 
 
 def ends_of_ranges(spec: AssemblySpec) -> Iterator[Values]:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ast_sim.number_arrays import real_numbers
+from ast_sim.number_arrays import real_numbers, three_numbers
 from ast_sim.scene import Scene
 from ast_sim.simulate.shapes import mesh
 from ast_sim.support.argument_checks import several
@@ -25,8 +25,9 @@ def box(low: Sequence[float], high: Sequence[float], cells: Sequence[int], **arr
 
     Raises:
         ConfigError: a size or a number of cells is not above 0.
+        DatasetError: these are no numbers, or not three where three are needed.
     """
-    low, high = _vector("the box", "low", low), _vector("the box", "high", high)
+    low, high = three_numbers("the box", "low", low), three_numbers("the box", "high", high)
     size = np.subtract(high, low)
     _require_above_zero("the box", size, cells)
     coordinates, elements = mesh.hexahedral_grid(tuple(cells))
@@ -44,8 +45,9 @@ def plate(size: Sequence[float], cells: Sequence[int], holes: Sequence[Sequence[
 
     Raises:
         ConfigError: a size or a number of cells is not above 0.
+        DatasetError: these are no numbers, or not three where three are needed.
     """
-    size = _vector("the plate", "size", size)
+    size = three_numbers("the plate", "size", size)
     _require_above_zero("the plate", size, cells)
     cut = real_numbers("the plate", "holes", holes).astype(np.float64)
     if cut.size and (cut.ndim != 2 or cut.shape[1] != 3 or not (cut[:, 2] > 0).all() or not np.isfinite(cut).all()):
@@ -64,9 +66,10 @@ def ball(center: Sequence[float], radius: float, cells: int, **arrays: Any) -> S
 
     Raises:
         ConfigError: the radius is not above 0, or the number of cells is not even.
+        DatasetError: these are no numbers, or not three where three are needed.
     """
     _require_above_zero("the ball", [radius], [cells], even=True)
-    center = _vector("the ball", "center", center)
+    center = three_numbers("the ball", "center", center)
     position, elements = mesh.ball(radius, cells)
     return Scene.of(position + center, elements, **arrays)
 
@@ -85,21 +88,14 @@ def cylinder(
 
     Raises:
         ConfigError: a size is not above 0, the number of cells is not even, or there is no such axis.
+        DatasetError: these are no numbers, or not three where three are needed.
     """
     _require_above_zero("the cylinder", [radius, length], [cells], even=True)
-    center = _vector("the cylinder", "center", center)
+    center = three_numbers("the cylinder", "center", center)
     if axis not in ("x", "y", "z"):
         raise ConfigError(f"the axis of the cylinder is {axis!r}; must be x, y or z")
     position, elements = mesh.cylinder(radius, length / 2, cells)
     return Scene.of(np.roll(position, "xyz".index(axis), axis=1) + center, elements, **arrays)
-
-
-def _vector(what: str, name: str, value: Sequence[float]) -> np.ndarray:
-    """[3] float64, of three finite numbers."""
-    numbers = real_numbers(what, name, value)
-    if numbers.shape != (3,) or not np.isfinite(numbers).all():
-        raise ConfigError(f"{name} of {what} must be three finite numbers")
-    return np.asarray(value, np.float64)
 
 
 def _require_above_zero(

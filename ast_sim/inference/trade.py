@@ -11,19 +11,20 @@ from dataclasses import dataclass, replace
 from itertools import islice
 from numbers import Real
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 
 from ast_sim.dataset.reader import Dataset
 from ast_sim.dataset.solver_seconds import read_seconds
 from ast_sim.inference.answering import answers
+from ast_sim.inference.calibrate import require_new_scenes, require_runs
 from ast_sim.inference.effort import Effort, choices, options_of
 from ast_sim.inference.evaluation.deepest_frames import deepest_predicted
 from ast_sim.inference.evaluation.gaussian_process import PROCESS, process_beside
 from ast_sim.inference.predicting.question import Question
-from ast_sim.inference.promises.calibration import require_new_scenes, require_runs
 from ast_sim.inference.quantities.relative_errors import QUANTITIES, errors_of, moves
+from ast_sim.inference.trained_run import Run
 from ast_sim.models.simulator import Simulator
 from ast_sim.simulate.jobs.fastest_solver import FINER, OWN_STOP_TEST, Outcome, solver_outcomes
 from ast_sim.support.argument_checks import file_name, several
@@ -35,9 +36,7 @@ from ast_sim.support.toml_settings import whole
 from ast_sim.trade_figures import Setting, Side, TradeFigures
 from ast_sim.view import trade_page
 from ast_sim.view.files import make_folder
-
-if TYPE_CHECKING:
-    from ast_sim.inference.trained_run import Run
+from ast_sim.view.page import page_name
 
 SCENES = 20
 MESH_SCENES = 3  # in which the mesh's own error is measured
@@ -77,7 +76,7 @@ class Trade:
             AstSimError: the suffix is neither .html nor .htm, or the file cannot be written.
             MissingExtra: plotly is not installed.
         """
-        make_folder(file_name(path, "path").parent)
+        make_folder(page_name(path).parent)
         trade_page.write(path, list(self.by_quantity.values()), title)
 
 

@@ -1,0 +1,195 @@
+"""The calibration of a run: its answers to scenes that are new to it, compared with the truth."""
+
+from __future__ import annotations
+
+import math
+import os
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ast_sim.dataset.reader import Dataset
+from ast_sim.inference.effort import Effort, choices
+from ast_sim.inference.promises.calibration import Calibration
+from ast_sim.inference.promises.familiarity import Familiarity
+from ast_sim.inference.promises.kept_errors import DISPLACEMENT, KeptErrors
+from ast_sim.inference.quantities.band import LEVEL, Comparison, compared
+from ast_sim.inference.quantities.relative_errors import moves
+from ast_sim.inference.trained_run import Run
+from ast_sim.runs.scope import spacing_of
+from ast_sim.scene import Trajectory
+from ast_sim.simulate.jobs.fastest_solver import deepest_frame
+from ast_sim.support.argument_checks import require_type
+from ast_sim.support.errors import ConfigError, warn
+from ast_sim.support.progress import Progress, ShowProgress
+
+FEWEST = math.ceil(LEVEL / (1 - LEVEL) - 1e-9)  # scenes with which the rank of the quantile is at most their number
+
+
+def quantile(scores: Sequence[float]) -> float:
+    """The ceil((n + 1) LEVEL)-th smallest of n scores; n is at least `FEWEST`."""
+    return sorted(scores)[math.ceil((len(scores) + 1) * LEVEL - 1e-9) - 1]
+
+
+def calibrate(
+    run: Run,
+    data: str | os.PathLike[str] | Dataset | None = None,
+    split: str = "calibration",
+    *,
+    progress: ShowProgress = True,
+) -> Calibration:
+    """Measure how far the answers of a run are from the truth, after its default effort and each effort among which one
+    is chosen for a wanted error; then answers with these efforts have a band.
+
+    The scenes must be new to the run: they have neither trained nor chosen it. Scenes outside the ranges of the
+    training do not count, since no band is given there; neither do scenes without motion. A warning says how many. The
+    folder of a run keeps the result beside its best checkpoint, and `Run.save` takes it along.
+
+    Args:
+        run: the run. A file is not changed: only this object knows the band, and a file that `run.save` writes of it.
+        data: a dataset, its path or open; by default the one that the run was trained on.
+        split: whose scenes are predicted.
+        progress: as in `generate`.
+
+    Raises:
+        ConfigError: the split has trained or chosen the run, there are fewer than 19 scenes, or too many fail.
+    """
+    require_runs(run)
+    with run.open(data) as dataset:
+        require_new_scenes(run, dataset, split)
+        before, run.calibration = run.calibration, None  # it has no say in which scenes count
+        try:
+            result, left_out = _measured(run, dataset, split, progress)
+        except BaseException:
+            run.calibration = before
+            raise
+    run.calibration = result
+    if left_out:
+        told = f"{len(left_out)} scenes lie outside the training or do not move, the first is {left_out[0]}"
+        warn(f"{told}: they do not count")
+    run.folder.keep_calibration(result.to_json())
+    if run.path.is_file():
+        warn(f"{run.path} is a file, which is not changed: Run.save writes one with the band")
+    return result
+
+
+def require_runs(*runs: Any) -> None:
+    """Raise ConfigError unless these are trained runs."""
+    for run in runs:
+        require_type("a run", run, Run, "a Run, such as ast_sim.Run(folder)")
+
+
+def require_new_scenes(run: Run, dataset: Dataset, split: str) -> None:
+    """Raise ConfigError if the scenes of a split have trained or chosen the run. A copy of its dataset is known."""
+    if split in ("train", "valid") and (
+        Path(run.settings.data).resolve() == dataset.path.resolve()
+        or run.folder.origin.get("data") == dataset.fingerprint()
+    ):
+        raise ConfigError(f"the scenes of {split} have trained or chosen the run: take other scenes")
+
+
+class _Measured(NamedTuple):
+    """A calibration scene.
+
+    Attributes:
+        comparisons: of the quantities in all frames, for each effort with a band; None where the prediction failed.
+        errors: of the deepest frame, for each effort among which one is chosen; None where the prediction failed.
+        spacing: as `Calibration` has it.
+        latents: [frames, D]; None: the model does not tell.
+    """
+
+    comparisons: list[dict[str, Comparison] | None]
+    errors: list[dict[str, float] | None]
+    spacing: float
+    latents: np.ndarray | None
+
+
+def _measured(run: Run, dataset: Dataset, split: str, progress: ShowProgress) -> tuple[Calibration, list[str]]:
+    """The calibration by the scenes of a split, and the names of the scenes that do not count."""
+    to_choose = choices(run.settings.model, run.settings.train.corrections)
+    efforts = to_choose if run.effort in to_choose else (*to_choose, run.effort)
+    scenes: list[_Measured] = []
+    left_out: list[str] = []
+    fields = [name for name, *_ in run.settings.model.data.fields]
+    with Progress(dataset.count(split), "scenes", progress) as bar, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # what they tell is counted here
+        for index in range(dataset.count(split)):
+            name = f"{split}/{index:06d}"
+            one = _measured_scene(run, dataset.load(split, index, fields), name, efforts, to_choose)
+            bar.advance(name)
+            if one is None:
+                left_out.append(name)
+            else:
+                scenes.append(one)
+    if len(scenes) < FEWEST:
+        raise ConfigError(
+            f"a band of {100 * LEVEL:g} % needs at least {FEWEST} calibration scenes, and there are {len(scenes)}: make"
+            " more with generate(..., calibration=N) (--calibration N)"
+        )
+    quantiles, typical = _quantiles([one.comparisons for one in scenes])
+    spacings = [one.spacing for one in scenes]
+    latents = [one.latents for one in scenes if one.latents is not None]
+    familiarity = Familiarity.of(latents) if len(latents) >= FEWEST else None
+    kept = _kept_errors(to_choose, [list(of_effort) for of_effort in zip(*(one.errors for one in scenes), strict=True)])
+    reach = (min(spacings), max(spacings))
+    return Calibration(len(scenes), efforts, quantiles, typical, reach, kept, familiarity), left_out
+
+
+def _quantiles(
+    scenes: Sequence[Sequence[Mapping[str, Comparison] | None]],
+) -> tuple[dict[str, tuple[float, ...]], dict[str, float]]:
+    """The quantiles of each quantity, one for each effort, and the typical sizes, from the comparisons by scene.
+
+    Raises:
+        ConfigError: with each effort too many predictions failed.
+    """
+    known = [one for scene in scenes for one in scene if one is not None]
+    quantiles: dict[str, tuple[float, ...]] = {}
+    typical: dict[str, float] = {}
+    for quantity in known[0] if known else ():
+        if not all(quantity in one for one in known):
+            continue
+        sizes = np.concatenate([one[quantity].true_sizes for one in known])
+        typical[quantity] = float(np.sqrt(np.square(sizes).mean()))
+        quantiles[quantity] = tuple(
+            quantile([math.inf if one is None else one[quantity].score(typical[quantity]) for one in of_effort])
+            for of_effort in zip(*scenes, strict=True)
+        )
+    if all(map(math.isinf, quantiles.get(DISPLACEMENT, ()))):
+        failed = min(of_effort.count(None) for of_effort in zip(*scenes, strict=True))
+        raise ConfigError(f"{failed} of {len(scenes)} predictions failed: no band holds")
+    return quantiles, typical
+
+
+def _measured_scene(
+    run: Run, truth: Trajectory, name: str, efforts: Sequence[Effort], to_choose: Sequence[Effort]
+) -> _Measured | None:
+    """A calibration scene; None: nothing moves in it, or it lies outside the training."""
+    if not moves(truth):
+        return None
+    answers = [run.predict(truth, effort=effort, throw=False, name=name, progress=False) for effort in efforts]
+    if answers[0].notes:
+        return None
+    comparisons = [None if one.failure is not None else compared(one, truth) for one in answers]
+    deepest = deepest_frame(truth)
+    alone = [
+        run.predict(truth, frames=deepest, effort=effort, throw=False, name=name, progress=False)
+        for effort in to_choose
+    ]
+    errors = [None if one.failure is not None else one.errors(truth) for one in alone]
+    latents = np.stack(list(answers[0].latents.values())) if answers[0].latents else None
+    return _Measured(comparisons, errors, spacing_of(truth.scene), latents)
+
+
+def _kept_errors(efforts: Sequence[Effort], errors: Sequence[Sequence[Mapping[str, float] | None]]) -> KeptErrors:
+    """The errors by quantity, effort and scene; None, where the prediction failed, is infinite."""
+    known = [one for of_scenes in errors for one in of_scenes if one is not None]
+    shared = [quantity for quantity in (known[0] if known else ()) if all(quantity in one for one in known)]
+    by_quantity = {
+        quantity: tuple(tuple(math.inf if one is None else one[quantity] for one in of_scenes) for of_scenes in errors)
+        for quantity in shared
+    }
+    return KeptErrors(tuple(efforts), by_quantity)
