@@ -112,8 +112,8 @@ def measured(run: Run) -> dict[str, Any]:
 
 def _error(predictor: str, quantity: str, horizon: str, nodes: str, key: str, scale: float) -> Callable[[Run], Any]:
     def value(run: Run) -> float | None:
-        by_horizon = measured(run).get("errors", {}).get(quantity, {}).get(predictor)
-        found = None if by_horizon is None else by_horizon[horizon][nodes][key]
+        errors = measured(run).get("errors", {}).get(quantity, {}).get(predictor, {}).get(horizon)
+        found = None if errors is None else errors[nodes][key]
         return None if found is None else scale * found
 
     return value
