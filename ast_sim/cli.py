@@ -108,7 +108,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 def _add_demo(demo: Parser) -> None:
     demo.add_argument("--out", type=path, default=Path("demo"), metavar="DIR", help="result folder (default: demo)")
-    demo.add_argument("--quick", action="store_true", help="fewer scenes and steps: 90 seconds on 2 cores")
+    demo.add_argument("--quick", action="store_true", help="fewer scenes and steps: 1.5 to 2.5 minutes on 2 cores")
     demo.add_argument("--seed", type=at_least(0), default=0, help="seed of scenes and training (default: 0)")
 
 

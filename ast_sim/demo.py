@@ -42,7 +42,7 @@ class Size:
 
 
 FULL = Size(train=1300, valid=20, test=10, steps=4000)  # about 15 minutes on 2 cores
-QUICK = Size(train=200, valid=4, test=3, steps=250)  # at most 90 seconds
+QUICK = Size(train=200, valid=4, test=3, steps=250)  # 1.5 to 2.5 minutes
 
 
 def demo(out: Path, quick: bool = False, seed: int = 0) -> Figures:
