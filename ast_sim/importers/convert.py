@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -23,7 +22,7 @@ from ast_sim.plausibility.findings import Finding, refusal, told
 from ast_sim.plausibility.motion import in_trajectory
 from ast_sim.scene import Trajectory
 from ast_sim.support.argument_checks import file_name, require_bool
-from ast_sim.support.errors import ConfigError, DatasetError, LooksWrong, nearest_name
+from ast_sim.support.errors import ConfigError, DatasetError, LooksWrong, nearest_name, warn
 from ast_sim.support.progress import Progress, ShowProgress
 
 SHARES = {"train": 0.8, "valid": 0.1, "test": 0.1}
@@ -126,7 +125,7 @@ def _tell(source: Path, findings: list[tuple[str, Finding]], strict: bool) -> No
     if findings and strict:
         raise DatasetError(f"{source}: {refusal(findings)}")
     for line in told(findings):
-        warnings.warn(line, LooksWrong, stacklevel=3)
+        warn(line, LooksWrong)
 
 
 def _trajectories(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +13,7 @@ from ast_sim.importers.series import FieldNames
 from ast_sim.importers.stress import STRESS_UNITS
 from ast_sim.material import YOUNG
 from ast_sim.scene import Trajectory
-from ast_sim.support.errors import ConfigError, DatasetError
+from ast_sim.support.errors import ConfigError, DatasetError, warn
 
 # Young's modulus of the softest gels and of diamond, in pascal.
 _SOFTEST = 1e2
@@ -66,8 +65,7 @@ def doubt_modulus(deck: Path, trajectory: Trajectory, unit: str) -> None:
     shown = moduli / STRESS_UNITS[unit]
     doubtful = (moduli < _SOFTEST) | (moduli > _STIFFEST) | ((shown > 0.1) & (shown < 10) & (unit != "GPa"))
     if doubtful.any():
-        warnings.warn(
+        warn(
             f"{deck}: Young's modulus is {shown[doubtful][0]:g} {unit}: is this the unit of stress beside this unit of"
-            " length? Rubber has about 5 MPa, steel 210000 MPa (210 GPa)",
-            stacklevel=3,
+            " length? Rubber has about 5 MPa, steel 210000 MPa (210 GPa)"
         )

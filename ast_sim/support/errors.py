@@ -62,14 +62,14 @@ class MissingExtra(AstSimError, ImportError):
     """An optional dependency that is not installed."""
 
 
-def warn(text: str) -> None:
+def warn(text: str, category: type[Warning] = UserWarning) -> None:
     """Warn of something at the line outside this package that led here, the one that its author can change."""
     level = 2
     frame = sys._getframe(1)
     while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] == _PACKAGE:
         frame = frame.f_back
         level += 1
-    warnings.warn(text, stacklevel=level)
+    warnings.warn(text, category, stacklevel=level)
 
 
 def nearest_name(name: str, known: Iterable[str]) -> str:

@@ -3,6 +3,7 @@ or the simulation is refused."""
 
 import re
 
+import h5py
 import numpy as np
 import pytest
 import pyvista
@@ -230,7 +231,6 @@ def test_numbers_of_parts_in_a_pvd_file_that_count_the_files_are_refused(tmp_pat
 
 
 def test_partitions_of_a_vtkhdf_file_may_change_places(tmp_path):
-    h5py = pytest.importorskip("h5py")
     cells = len(CUBE.elements)
     with h5py.File(tmp_path / "a.vtkhdf", "w") as file:
         root = file.create_group("VTKHDF")

@@ -14,7 +14,6 @@ import signal
 import subprocess
 import sys
 import tempfile
-import warnings
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -34,7 +33,7 @@ from ast_sim.importers.formats.frd_results import given_up, read_frd_headers
 from ast_sim.importers.formats.source_mesh import SourceMesh
 from ast_sim.importers.formats.together import labels_of, together
 from ast_sim.importers.formats.vtk_cells import blocks_of
-from ast_sim.support.errors import DatasetError, require
+from ast_sim.support.errors import DatasetError, require, warn
 
 READING_MODULE = "ast_sim.importers.formats.reading_worker"
 EXODUS = (".e", ".ex2", ".exo", ".exoii", ".exii", ".g", ".gen")
@@ -92,10 +91,9 @@ def _is_given_up(path: Path) -> bool:
     """Whether the last increment of a job did not converge; a warning says that it is left out."""
     time = given_up(path, read_frd_headers(path)[1])
     if time is not None:
-        warnings.warn(
+        warn(
             f"{path}: the job did not converge: the increment at the time {time:g} is the state in which CalculiX gave"
-            " up, and is left out",
-            stacklevel=3,
+            " up, and is left out"
         )
     return time is not None
 

@@ -130,9 +130,8 @@ def _by_place(
     facts: tuple[str, ...],
     refuse: bool,
 ) -> list[int] | None:
-    """The order in which the pieces are the ones of the first frame. None, or an error, if places do not tell."""
-    if not _same_kinds(mine, theirs, facts):
-        return None
+    """The order in which pieces of the same kinds are the ones of the first frame. None, or an error, if places do not
+    tell."""
     given, wanted = _keys(mine, facts), _keys(theirs, facts)
     order = [0] * len(wanted)
     for key in set(wanted):

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import warnings
 from pathlib import Path
 
 import numpy as np
 
 from ast_sim.importers.shells import Shells
-from ast_sim.support.errors import DatasetError
+from ast_sim.support.errors import DatasetError, warn
 
 # Points count as equal if they differ by less than this share of the size of the mesh.
 _AGREEMENT = 1e-4
@@ -88,8 +87,7 @@ def warn_of_rounding(source: Path, rest: np.ndarray, position: np.ndarray) -> No
     largest = max(np.abs(one - rest).max() for one in position)
     worst = max(np.abs(one.astype(np.float32) - small - (one - rest)).max() for one in position)
     if worst > _ROUNDING * largest:
-        warnings.warn(
+        warn(
             f"{source}: the largest displacement is {largest:.3g}, and rounding to float32 changes displacements by up"
-            f" to {worst:.3g}: the motion is too small for coordinates of up to {np.abs(position).max():.3g}",
-            stacklevel=3,
+            f" to {worst:.3g}: the motion is too small for coordinates of up to {np.abs(position).max():.3g}"
         )

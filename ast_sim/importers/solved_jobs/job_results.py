@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +13,7 @@ from ast_sim.importers.formats.vtk_files import vtk_frames
 from ast_sim.importers.solved_jobs.job import Job
 from ast_sim.importers.stress import order_of, von_mises
 from ast_sim.scene import NodeType
-from ast_sim.support.errors import DatasetError
+from ast_sim.support.errors import DatasetError, warn
 
 # The coordinates of a deck and of its results may differ by this share of the size of the mesh; results have 6 digits.
 _AGREEMENT = 1e-4
@@ -58,10 +57,9 @@ def job_frames(job: Job, results: Path, pascals: float, wanted: Sequence[str] = 
         last = frame.time
         yield replace(mesh, point_fields=fields, time=frame.time)
     if last is not None and job.ends and last < job.ends[-1] * (1 - 1e-6):
-        warnings.warn(
+        warn(
             f"{results}: ends at the time {last:g}, but the steps of {job.mesh.path.name} end at {job.ends[-1]:g}: the"
-            " job was not solved to its end, or its last increment was not written",
-            stacklevel=2,
+            " job was not solved to its end, or its last increment was not written"
         )
 
 
