@@ -123,7 +123,6 @@ def test_files_that_have_no_name(run, scene, data, answer, tmp_path):
             ast_sim.Dataset,
             run.save,
             run.open,
-            run.report,
             answer.save,
             answer.save_forces,
             ast_sim.new_model,

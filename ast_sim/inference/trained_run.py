@@ -35,7 +35,6 @@ from ast_sim.support.notebook_table import html_table, one_line
 from ast_sim.support.progress import Progress, ShowProgress
 from ast_sim.support.provenance import provenance
 from ast_sim.support.toml_settings import NOTHING, whole
-from ast_sim.view.page import page_name
 
 
 class Run:
@@ -342,8 +341,3 @@ class Run:
                 figures = evaluate(self.model, dataset, split, bar.advance, self.effort, solver_scenes, made_from)
             origin = {"run": str(self.path), "step": self.step, "data": str(dataset.path), "split": split}
             return Evaluation(self, dataset.path, dataclasses.replace(figures, origin=provenance(command) | origin))
-
-    def report(self, path: str | os.PathLike[str], data: str | os.PathLike[str] | Dataset | None = None) -> None:
-        """Evaluate on the test split and write a page with the results."""
-        page = page_name(path)
-        self.evaluate(data).report(page)
