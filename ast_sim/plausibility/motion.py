@@ -1,5 +1,5 @@
 """What looks wrong in the frames of a simulation: tools that change their shape, displacements in other units, elements
-that turn over, frames that repeat, no motion, contact that no model can see.
+that turn over, frames that repeat, bodies that change their places, no motion, contact that no model can see.
 
 Legend: S frames, N nodes, E elements.
 """
@@ -12,6 +12,7 @@ import numpy as np
 
 from ast_sim.element_topology import signed_volumes
 from ast_sim.number_arrays import point
+from ast_sim.plausibility.body_places import change_places
 from ast_sim.plausibility.findings import Finding, places
 from ast_sim.plausibility.topology import at_rest
 from ast_sim.scene import Scene, Trajectory
@@ -38,7 +39,8 @@ def in_trajectory(trajectory: Trajectory) -> list[Finding]:
     """What looks wrong in a simulation."""
     scene, position = trajectory.scene, trajectory.position
     findings = [*at_rest(scene), *_still(scene, position), *_far(scene, position), *_soft_tools(scene, position)]
-    return [*findings, *_turn_over(scene, position), *_repeats(position, trajectory.stress), *_contact(scene, position)]
+    findings += [*_turn_over(scene, position), *_repeats(position, trajectory.stress)]
+    return [*findings, *change_places(scene, position), *_contact(scene, position)]
 
 
 def _still(scene: Scene, position: np.ndarray) -> list[Finding]:

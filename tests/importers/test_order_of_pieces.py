@@ -13,6 +13,7 @@ from vtkmodules.vtkCommonDataModel import vtkCompositeDataSet, vtkMultiBlockData
 from vtkmodules.vtkIOXML import vtkXMLMultiBlockDataWriter, vtkXMLUnstructuredGridWriter
 
 from ast_sim.importers.series import FieldNames, read_series
+from ast_sim.plausibility.motion import in_trajectory
 from ast_sim.support.errors import DatasetError
 
 CUBE = block(1, 1, 1)
@@ -253,3 +254,39 @@ def test_partitions_of_a_vtkhdf_file_may_change_places(tmp_path):
     read = read_series(tmp_path / "a.vtkhdf", NAMES)
     require_motion(read, cubes)
     assert REORDERED in read.attributes["notes"]
+
+
+def write_grid(path, parts):
+    """All bodies in one grid."""
+    points = np.concatenate(parts)
+    elements = np.concatenate([CUBE.elements + 8 * index for index in range(len(parts))])
+    grid(points, elements).save(path)
+
+
+def told_frames(folder, parts_of_frame, frames=4):
+    for frame in range(frames):
+        write_grid(folder / f"f{frame}.vtu", parts_of_frame(frame))
+    findings = in_trajectory(read_series(folder, NAMES))
+    return [one.places for one in findings if one.what == "frames in which bodies change their places"]
+
+
+def test_equal_bodies_of_one_grid_that_change_places_are_told(tmp_path):
+    """Nothing but their places tells: the grid has no blocks, the elements of both numberings are the same."""
+    assert told_frames(tmp_path, lambda frame: turned(cubes(frame), frame)) == ["frames 1, 2"]
+
+
+def test_bodies_that_move_apart_together_or_around_are_not_told(tmp_path):
+    def apart(frame):
+        return CUBE.rest_position - (0.3 * frame, 0, 0), CUBE.rest_position + (1.2 + 0.3 * frame, 0, 0)
+
+    def together(frame):  # each cube where the next one was
+        return [CUBE.rest_position + (1.5 * (index + frame), 0, 0) for index in range(3)]
+
+    def around(frame):  # an eighth of a turn in each frame
+        angle = np.pi / 4 * frame
+        turn = np.array([(np.cos(angle), np.sin(angle), 0), (-np.sin(angle), np.cos(angle), 0), (0, 0, 1)])
+        return [(CUBE.rest_position + shift) @ turn for shift in ((2, 0, 0), (-3, -1, 0))]
+
+    for name, motion in (("apart", apart), ("together", together), ("around", around)):
+        (tmp_path / name).mkdir()
+        assert told_frames(tmp_path / name, motion) == [], name

@@ -15,12 +15,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ast_sim.importers.formats.source_mesh import SourceMesh
+from ast_sim.plausibility.body_places import nearest_bodies
 from ast_sim.support.errors import DatasetError
-
-# How far the way between two equal pieces may have changed, as a share of how far it would have if they had changed
-# their places: the first if they stand as before, the second if they do not.
-_KEPT = 0.8
-_CHANGED = 0.25
 
 _WHAT_HELPS = "give them names, or the points global ids, or write them in one order in all frames"
 
@@ -142,7 +138,7 @@ def _by_place(
             continue
         now = np.stack([frame.points[mine[index].rows].ravel() for index in those])
         then = np.stack([before[theirs[index].rows].ravel() for index in places])
-        nearest = _nearest(now, then)
+        nearest = nearest_bodies(now, then)
         if nearest is None:
             if not refuse:
                 return None
@@ -153,15 +149,3 @@ def _by_place(
         for place, index in zip(places, nearest, strict=True):
             order[place] = those[index]
     return order
-
-
-def _nearest(now: np.ndarray, then: np.ndarray) -> list[int] | None:
-    """Which of the equal pieces now [k, d] is each one of then [k, d]; None if that is not clear."""
-    from scipy.optimize import linear_sum_assignment
-    from scipy.spatial.distance import cdist, pdist
-
-    order = linear_sum_assignment(cdist(then, now, "sqeuclidean"))[1]
-    now = now[order]
-    alike = (order == np.arange(len(order))).all()
-    clear = pdist(now - then) <= (_KEPT if alike else _CHANGED) * pdist(now + then)
-    return order.tolist() if clear.all() else None
