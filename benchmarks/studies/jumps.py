@@ -83,11 +83,11 @@ ROWS = {
         "Plates, 400 nodes, third seed", steps=10_000, settings={**_MIRRORED, "seed": 2}, **_PLATES_400
     ),
     "plates400_long": Row(
-        "Plates, 400 nodes, 20,000 steps, with reactions", steps=20_000, settings=_MIRRORED, solver_scenes=10,
+        "Plates, 400 nodes, 80,000 steps, with reactions", steps=80_000, settings=_MIRRORED, solver_scenes=10,
         model_settings={"state": ("reaction",)}, **_PLATES_400,
     ),
     "plates400_long_transolver": Row(
-        "Plates, 400 nodes, Transolver, 23,600 steps, with reactions", steps=23_600, model="transolver",
+        "Plates, 400 nodes, Transolver, 94,400 steps, with reactions", steps=94_400, model="transolver",
         settings=_MIRRORED, model_settings={"state": ("reaction",)}, **_PLATES_400,
     ),
     "plates400_transolver": Row(

@@ -1,7 +1,7 @@
 """The runs that come with the package, from nothing: simulated, trained, calibrated and saved.
 
 `python -m benchmarks.studies.shipped [NAME ...]` (or `make shipped`, both) writes ast_sim/example_runs/NAME.ast. Data
-and runs lie in `--folder`; a second call goes on with what is there. On one thread plates take about two and a half
+and runs lie in `--folder`; a second call goes on with what is there. On one thread plates take about two
 hours, the clip about one and a half, of which CalculiX takes 40 minutes.
 """
 
