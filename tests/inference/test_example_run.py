@@ -90,7 +90,7 @@ def test_a_sweep_sees_where_the_ram_turns():
 
 def test_it_says_where_it_comes_from_and_an_unknown_name_is_one_line():
     run = ast_sim.example_run("plates")
-    assert (run.step, run.settings.train.corrections, run.settings.data) == (20_000, 0, "plates400.h5")
+    assert (run.step, run.settings.train.corrections, run.settings.data) == (80_000, 0, "plates400.h5")
     assert run.effort == ast_sim.Effort(0, 10) and run.scope.family == "deforming_plate"
     with pytest.raises(ConfigError, match="there is no example run 'plate'; did you mean 'plates'"):
         ast_sim.example_run("plate")
@@ -103,6 +103,6 @@ def test_info_tells_a_calibration_in_words(capsys):
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) < 200 and max(map(len, lines)) < 120
     assert "    band of 95 %" in lines and "    largest error in 90 % of scenes" in lines
-    assert any("up to 1 Newton step " in line and line.endswith(" 1.8 %") for line in lines)
+    assert any("up to 1 Newton step " in line and line.endswith(" 1.6 %") for line in lines)
     assert main(["info", path, "--json"]) == 0
     assert len(json.loads(capsys.readouterr().out)["answers"]["calibration"]["familiarity"]["scores"]) == 97
