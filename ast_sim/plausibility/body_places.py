@@ -48,14 +48,8 @@ def change_places(scene: Scene, position: np.ndarray) -> list[Finding]:
         "a body lies where another with an equal mesh lay in the frame before: are the points numbered otherwise in"
         " these frames? Write them in one order"
     )
-    return [
-        Finding(
-            "frames in which bodies change their places",
-            len(frames),
-            places("frames", np.array(sorted(frames))),
-            meaning,
-        )
-    ]
+    where = places("frames", np.array(sorted(frames)))
+    return [Finding("frames in which bodies change their places", len(frames), where, meaning)]
 
 
 def _equal_bodies(scene: Scene) -> Iterator[np.ndarray]:
@@ -66,15 +60,16 @@ def _equal_bodies(scene: Scene) -> Iterator[np.ndarray]:
     elements_by_body = _rows_by_number(scene.body[scene.elements[:, 0]])
     for number, nodes in nodes_by_body.items():
         local[nodes] = np.arange(len(nodes))
-        elements = local[scene.elements[elements_by_body[number]]] if number in elements_by_body else nodes[:0]
+        elements = local[scene.elements[elements_by_body.get(number, nodes[:0])]]
         kinds.setdefault((len(nodes), elements.tobytes()), []).append(nodes)
     yield from (np.stack(bodies) for bodies in kinds.values() if len(bodies) > 1)
 
 
 def _rows_by_number(numbers: np.ndarray) -> dict[int, np.ndarray]:
     """The rows of each number, ascending."""
-    known, starts = np.unique(np.sort(numbers), return_index=True)
-    return dict(zip(known.tolist(), np.split(np.argsort(numbers, kind="stable"), starts[1:]), strict=True))
+    order = np.argsort(numbers, kind="stable")
+    known, starts = np.unique(numbers[order], return_index=True)
+    return dict(zip(known.tolist(), np.split(order, starts[1:]), strict=True))
 
 
 def _may_have_changed(now: np.ndarray, then: np.ndarray) -> bool:

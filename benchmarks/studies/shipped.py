@@ -1,8 +1,8 @@
 """The runs that come with the package, from nothing: simulated, trained, calibrated and saved.
 
 `python -m benchmarks.studies.shipped [NAME ...]` (or `make shipped`, both) writes ast_sim/example_runs/NAME.ast. Data
-and runs lie in `--folder`; a second call goes on with what is there. On one thread plates take about two
-hours, the clip about one and a half, of which CalculiX takes 40 minutes.
+and runs lie in `--folder`; a second call goes on with what is there. On one thread plates take about 100
+minutes (Zen 5), the clip about 90, of which CalculiX takes 40.
 """
 
 from __future__ import annotations
