@@ -149,12 +149,16 @@ COMPILE_gcc11 := gcc-11 $(C_FLAGS) $(GCC_WARNINGS) -O2
 COMPILE_clang := clang $(C_FLAGS) $(WARNINGS) -O2 -DAST_UNFUSED
 COMPILE_aarch64 := aarch64-linux-gnu-gcc $(C_FLAGS) $(GCC_WARNINGS) -O2
 
-CORE := isa_base dispatch parallel memory status tests/simd_base
+CORE := isa_base dispatch parallel memory status tests/simd_base tests/bfloat16_base
 ifneq ($(X86),)
 CORE_X86 := isa_avx2 isa_avx512
+# What differs in them no sanitizer sees: tiles read and write behind the compiler's back.
+CORE_bfloat16 := isa_avx512_bf16 isa_amx
 SIMD_X86 := tests/simd_avx2 tests/simd_avx512
 FLAGS_isa_avx2 := -mavx2 -mfma
 FLAGS_isa_avx512 := -mavx512f -mavx512bw -mavx512dq -mavx512vl -mfma -mprefer-vector-width=512
+FLAGS_isa_avx512_bf16 := $(FLAGS_isa_avx512) -mavx512bf16
+FLAGS_isa_amx := $(FLAGS_isa_avx512_bf16) -mamx-tile -mamx-bf16
 FLAGS_tests/simd_avx2 := $(FLAGS_isa_avx2)
 FLAGS_tests/simd_avx512 := $(FLAGS_isa_avx512)
 FLAGS_dispatch := -DAST_HAVE_AVX2 -DAST_HAVE_AVX512
@@ -167,13 +171,14 @@ define BUILD
 build/check/$(1)/%.o: csrc/%.c $(C_SOURCES) | tools
 	@mkdir -p $$(@D)
 	@$(COMPILE_$(1)) $$(FLAGS_$$*) -c $$< -o $$@
-build/check/$(1)/core.a: $(patsubst %,build/check/$(1)/%.o,$(CORE) $(if $(filter wide aarch64,$(1)),,$(CORE_X86)) $(if $(filter aarch64,$(1)),,$(SIMD_X86)))
+build/check/$(1)/core.a: $(patsubst %,build/check/$(1)/%.o,$(CORE) $(if $(filter wide aarch64,$(1)),,$(CORE_X86)) $(if $(filter plain gcc11 clang,$(1)),$(CORE_bfloat16)) $(if $(filter aarch64,$(1)),,$(SIMD_X86)))
 	@ar rcs $$@ $$^
 $(patsubst %,build/check/$(1)/test_%,$(C_TESTS)): build/check/$(1)/test_%: csrc/tests/test_%.c $(C_TEST_HEADERS) build/check/$(1)/core.a
 	@$(COMPILE_$(1)) $$< build/check/$(1)/core.a -lm $$(LINK_test_$$*) -o $$@
 endef
 $(foreach build,$(BUILDS) fuzz,$(eval $(call BUILD,$(build))))
 build/check/wide/%.o build/check/aarch64/%.o: FLAGS_dispatch :=
+build/check/plain/%.o build/check/gcc11/%.o build/check/clang/%.o: FLAGS_dispatch += $(if $(X86),-DAST_HAVE_AVX512_BF16 -DAST_HAVE_AMX)
 
 $(addprefix build/check/fuzz/fuzz_,$(C_FUZZERS)): build/check/fuzz/fuzz_%: csrc/tests/fuzz_%.c csrc/tests/test_%.c $(C_TEST_HEADERS) build/check/fuzz/core.a
 	@$(COMPILE_target) -c $< -o $@.o

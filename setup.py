@@ -21,18 +21,21 @@ FLAGS = [
     "-Wno-unknown-pragmas",
     "-Wno-psabi",
 ]
+AVX512 = [
+    "-mavx512f",
+    "-mavx512bw",
+    "-mavx512dq",
+    "-mavx512vl",
+    "-mfma",
+    "-ffp-contract=fast",
+    "-mprefer-vector-width=512",
+]
 INSTRUCTION_SETS = {
     "base": [],
     "avx2": ["-mavx2", "-mfma", "-ffp-contract=fast"],
-    "avx512": [
-        "-mavx512f",
-        "-mavx512bw",
-        "-mavx512dq",
-        "-mavx512vl",
-        "-mfma",
-        "-ffp-contract=fast",
-        "-mprefer-vector-width=512",
-    ],
+    "avx512": AVX512,
+    "avx512_bf16": [*AVX512, "-mavx512bf16"],
+    "amx": [*AVX512, "-mavx512bf16", "-mamx-tile", "-mamx-bf16"],
 }
 HEADERS = [str(path) for path in sorted(Path("csrc").glob("*.h"))]
 SOURCES = [str(path) for path in sorted(Path("csrc").glob("*.c"))]

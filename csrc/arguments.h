@@ -15,8 +15,12 @@
 #undef I /* of complex.h, which NumPy includes: here it is a number of inputs */
 #include "ast.h"
 
-static const ast_kernels *kernels; /* of the chosen instruction set */
-static bool debug;                 /* AST_SIM_DEBUG=1 */
+static const ast_kernels *float32_kernels; /* of the chosen instruction set */
+static ast_kernels bfloat16_kernels;       /* the same, but for products in bfloat16; without a name: there are none */
+static _Thread_local bool bfloat16_products; /* whether this thread wants them */
+static bool debug;                           /* AST_SIM_DEBUG=1 */
+
+static const ast_kernels *chosen_kernels(void) { return bfloat16_products ? &bfloat16_kernels : float32_kernels; }
 
 typedef struct {
   void *data;                 /* NULL where None was given */

@@ -64,7 +64,7 @@ AST_INLINE void gemm_pack_columns(const float *b, int64_t row, int64_t column, i
 }
 
 /* panels of B_kj = b[k*row + j*column], j < N, padded with zeros to whole panels */
-static void gemm_pack(const float *b, int64_t row, int64_t column, int64_t K, int64_t N, float *panels) {
+static inline void gemm_pack(const float *b, int64_t row, int64_t column, int64_t K, int64_t N, float *panels) {
   for (int64_t j = 0; j < N; j += GEMM_COLUMNS)
     gemm_pack_columns(b + j * column, row, column, K, min64(GEMM_COLUMNS, N - j), GEMM_COLUMNS, panels + j * K);
 }

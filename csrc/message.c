@@ -63,12 +63,12 @@ static bool message_new_tile(const message_weights *w, message_tile *t) {
   return true;
 }
 
-/* One register tile of x: channels of panel p of the edges from m on. P + Q comes last: large values cost the product
+/* One register tile of x: channels of panel p of the edges from the i0-th of a block on. P + Q comes last: large values cost the product
  * no digits. Latents stand where the sums of the product would. */
-AST_INLINE void message_first_tile(const int rows, const int vectors, const message_weights *w, int64_t p, int64_t m,
-                                   const float *h, float *x) {
+AST_INLINE void message_first_tile(const int rows, const int vectors, const message_weights *w,
+                                   const dense_block *block, int64_t p, int64_t first, int64_t i0, float *x) {
   const ast_message *s = w->step;
-  const int64_t c = p * GEMM_COLUMNS, n = s->F - c;
+  const int64_t c = p * GEMM_COLUMNS, n = s->F - c, m = first + i0;
   vf sum[GEMM_ROWS][2];
   EACH(rows, i) {
     const float *next = s->of_senders + s->senders[min64(m + i + MESSAGE_TILE, s->M - 1)] * s->F + c;
@@ -81,8 +81,7 @@ AST_INLINE void message_first_tile(const int rows, const int vectors, const mess
     const float *e = s->edge_features + m * s->F + c;
     TILE_EACH(i, v) sum[i][v] = vload_upto(e + i * s->F + v * VW, n - v * VW);
   }
-  const dense_layer *l = &w->layers[MESSAGE_A2];
-  if (s->H) dense_sums(rows, vectors, l, (gemm_a){h, w->row, 1}, l->panels + c * s->H, sum);
+  if (s->H) dense_sums(rows, vectors, block, p, i0, sum);
   EACH(rows, i) {
     const float *P = s->of_senders + s->senders[m + i] * s->F + c,
                 *Q = s->of_receivers + s->receivers[m + i] * s->F + c;
@@ -93,9 +92,9 @@ AST_INLINE void message_first_tile(const int rows, const int vectors, const mess
   }
 }
 
-AST_INLINE void message_first_strip(const int vectors, const message_weights *w, int64_t p, int64_t first, int64_t n,
-                                    const message_tile *t) {
-#define FIRST_TILE(rows) message_first_tile(rows, vectors, w, p, first + i, t->h + i * w->row, t->x + i * w->row)
+AST_INLINE void message_first_strip(const int vectors, const message_weights *w, const dense_block *block, int64_t p,
+                                    int64_t first, int64_t n, const message_tile *t) {
+#define FIRST_TILE(rows) message_first_tile(rows, vectors, w, block, p, first, i, t->x + i * w->row)
   EACH_TILE_OF_ROWS(i, n, FIRST_TILE);
 #undef FIRST_TILE
 }
@@ -105,9 +104,12 @@ static void message_layers(const message_weights *w, int64_t first, int64_t n, c
   const ast_message *step = w->step;
   const gemm_a e = {step->edge_features + first * step->E, step->E, 1};
   dense_all(&w->layers[MESSAGE_A1], n, e, (dense_end){.activation = AST_RELU, .out = t->h, .out_row = w->row});
+  dense_block block;
+  dense_new_block(&block, &w->layers[MESSAGE_A2], (gemm_a){t->h, w->row, 1}, n);
   for (int64_t p = 0; p * GEMM_COLUMNS < step->F; p++) {
-    if (step->F - p * GEMM_COLUMNS > VW) message_first_strip(2, w, p, first, n, t);
-    else message_first_strip(1, w, p, first, n, t);
+    if (step->H) dense_begin_panel(&block, p);
+    if (step->F - p * GEMM_COLUMNS > VW) message_first_strip(2, w, &block, p, first, n, t);
+    else message_first_strip(1, w, &block, p, first, n, t);
   }
   dense_all(&w->layers[MESSAGE_W2], n, (gemm_a){t->x, w->row, 1}, (dense_end){.out = t->y, .out_row = w->row});
 }

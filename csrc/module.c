@@ -125,8 +125,29 @@ static PyObject *configuration(PyObject *self, PyObject *unused) {
     Py_XDECREF(name);
   }
   if (!supported) return NULL;
-  return Py_BuildValue("{s:s,s:N,s:L,s:O}", "isa", kernels->isa, "supported", supported, "threads",
-                       (long long)ast_threads(), "debug", debug ? Py_True : Py_False);
+  return Py_BuildValue("{s:s,s:N,s:z,s:L,s:O}", "isa", float32_kernels->isa, "supported", supported, "bfloat16",
+                       bfloat16_kernels.isa, "threads", (long long)ast_threads(), "debug", debug ? Py_True : Py_False);
+}
+
+/* Whether products were in bfloat16 so far. */
+static PyObject *multiply_in_bfloat16(PyObject *self, PyObject *wanted) {
+  (void)self;
+  const int on = PyObject_IsTrue(wanted);
+  if (on < 0) return NULL;
+  if (on && !bfloat16_kernels.isa) return PyErr_Format(PyExc_ValueError, "there are no products in bfloat16");
+  const bool before = bfloat16_products;
+  bfloat16_products = on;
+  return PyBool_FromLong(before);
+}
+
+/* The float32 kernels, with those of another table in their place where it has some. */
+static void prepare_bfloat16(const ast_kernels *table) {
+  if (!table) return;
+  bfloat16_kernels = *float32_kernels;
+  bfloat16_kernels.isa = table->isa;
+#define TAKE(kernel) \
+  if (table->kernel) bfloat16_kernels.kernel = table->kernel;
+  AST_KERNELS(TAKE)
 }
 
 static PyMethodDef methods[] = {
@@ -140,7 +161,9 @@ static PyMethodDef methods[] = {
      "set_pool(parallel_for, num_threads): addresses of torch's thread pool, 0 for serial."},
     {"keep_memory", keep_memory, METH_NOARGS, "Let the C library keep freed blocks; whether it had an effect."},
     {"configuration", configuration, METH_NOARGS,
-     "The chosen instruction set, the supported ones, the threads, the debug mode."},
+     "The chosen instruction set, the supported ones, the one for bfloat16 or None, the threads, the debug mode."},
+    {"multiply_in_bfloat16", multiply_in_bfloat16, METH_O,
+     "multiply_in_bfloat16(wanted): how dense layers of this thread multiply from now on; whether they did so before."},
     {NULL, NULL, 0, NULL},
 };
 
@@ -149,8 +172,11 @@ static int execute(PyObject *module) {
   if (PyModule_AddStringConstant(module, "checks", check_names)) return -1;
   const char *wanted = getenv("AST_SIM_ISA"), *check = getenv("AST_SIM_DEBUG");
   debug = check && !strcmp(check, "1");
-  kernels = ast_select(wanted && *wanted ? wanted : NULL);
-  if (kernels) return 0;
+  float32_kernels = ast_select(wanted && *wanted ? wanted : NULL);
+  if (float32_kernels) {
+    if (!wanted || !*wanted) prepare_bfloat16(ast_bfloat16(0));
+    return 0;
+  }
   PyErr_Format(PyExc_ImportError,
                "AST_SIM_ISA=%s is not supported by this processor and build; unset it or choose base, avx2 or avx512",
                wanted);

@@ -57,20 +57,22 @@ static bool call_run(call *c, run_function function, void *result, ast_status *s
 /* ---- sums of rows ---- */
 
 KERNEL(segment_sum, x, node_order, node_offsets, mean, out) {
-  return kernels->segment_sum(a->x.data, n['F'], a->node_order.data, a->node_offsets.data, n['C'], a->mean.integer,
-                              a->out.data);
+  return chosen_kernels()->segment_sum(a->x.data, n['F'], a->node_order.data, a->node_offsets.data, n['C'],
+                                       a->mean.integer, a->out.data);
 }
 
 KERNEL(segment_spread, dout, node_order, node_offsets, mean, dx) {
-  return kernels->segment_spread(a->dout.data, n['F'], a->node_order.data, a->node_offsets.data, n['C'],
-                                 a->mean.integer, a->dx.data);
+  return chosen_kernels()->segment_spread(a->dout.data, n['F'], a->node_order.data, a->node_offsets.data, n['C'],
+                                          a->mean.integer, a->dx.data);
 }
 
-KERNEL(column_sum, x, out) { return kernels->column_sum(a->x.data, n['N'], n['F'], a->out.data); }
+KERNEL(column_sum, x, out) { return chosen_kernels()->column_sum(a->x.data, n['N'], n['F'], a->out.data); }
 
 /* ---- the step of Muon ---- */
 
-KERNEL(orthogonalize, x, out) { return kernels->orthogonalize(a->x.data, n['K'], n['R'], n['C'], a->out.data); }
+KERNEL(orthogonalize, x, out) {
+  return chosen_kernels()->orthogonalize(a->x.data, n['K'], n['R'], n['C'], a->out.data);
+}
 
 /* ---- elastic forces ---- */
 
@@ -84,12 +86,12 @@ static ast_elastic elastic_of(const void *arguments, const int64_t *n) {
 
 KERNEL(elastic_forces, ELASTIC, force) {
   const ast_elastic s = elastic_of(a, n);
-  return kernels->elastic_forces(&s, a->force.data);
+  return chosen_kernels()->elastic_forces(&s, a->force.data);
 }
 
 KERNEL(elastic_forces_backward, dforce, ELASTIC, dposition) {
   const ast_elastic s = elastic_of(&a->position, n);
-  return kernels->elastic_forces_backward(&s, a->dforce.data, a->dposition.data);
+  return chosen_kernels()->elastic_forces_backward(&s, a->dforce.data, a->dposition.data);
 }
 
 /* ---- proximity ---- */
@@ -98,7 +100,7 @@ KERNEL(elastic_forces_backward, dforce, ELASTIC, dposition) {
 
 KERNEL(proximity, PROXIMITY, radius, out) {
   const ast_proximity s = {LIST_OF(SIZE, B, N, F), LIST_OF(FIELD, PROXIMITY), .radius = a->radius.number};
-  return kernels->proximity(&s, a->out.data);
+  return chosen_kernels()->proximity(&s, a->out.data);
 }
 
 static bool proximity_check(const call *c) {
@@ -113,18 +115,18 @@ static bool proximity_check(const call *c) {
 /* ---- the order of nodes ---- */
 
 KERNEL(breadth_first, elements, wanted, rank) {
-  return kernels->breadth_first(a->elements.data, n['E'], n['K'], a->wanted.data, n['N'], a->rank.data);
+  return chosen_kernels()->breadth_first(a->elements.data, n['E'], n['K'], a->wanted.data, n['N'], a->rank.data);
 }
 
 /* ---- meshes ---- */
 
 KERNEL(counting_sort, num, index, order, offsets) {
-  return kernels->counting_sort(a->index.data, n['M'], n['N'], a->order.data, a->offsets.data);
+  return chosen_kernels()->counting_sort(a->index.data, n['M'], n['N'], a->order.data, a->offsets.data);
 }
 
 KERNEL(mesh_edges, num_nodes, elements, ends, senders, receivers, offsets) {
-  return kernels->mesh_edges(a->elements.data, n['E'], n['K'], a->ends.data, n['P'], n['N'], a->senders.data,
-                             a->receivers.data, a->offsets.data);
+  return chosen_kernels()->mesh_edges(a->elements.data, n['E'], n['K'], a->ends.data, n['P'], n['N'], a->senders.data,
+                                      a->receivers.data, a->offsets.data);
 }
 
 static bool mesh_edges_count(call *c, PyObject *list) {
@@ -137,7 +139,8 @@ static bool mesh_edges_count(call *c, PyObject *list) {
 }
 
 KERNEL(outer_faces, num_nodes, elements, faces, outer) {
-  return kernels->outer_faces(a->elements.data, n['E'], n['K'], a->faces.data, n['Q'], n['N'], a->outer.data, result);
+  return chosen_kernels()->outer_faces(a->elements.data, n['E'], n['K'], a->faces.data, n['Q'], n['N'], a->outer.data,
+                                       result);
 }
 
 static bool outer_faces_count(call *c, PyObject *list) {
@@ -154,9 +157,9 @@ static bool outer_faces_count(call *c, PyObject *list) {
 KERNEL(octree, positions, offsets, x, y, z, half_width, depth, keys, cell_offsets, node_cell, node_order,
        node_offsets) {
   const double center[3] = {a->x.number, a->y.number, a->z.number};
-  return kernels->octree_build(a->positions.data, a->offsets.data, n['B'], center, a->half_width.number,
-                               (int)a->depth.integer, a->keys.data, a->cell_offsets.data, a->node_cell.data,
-                               a->node_order.data, a->node_offsets.data, result);
+  return chosen_kernels()->octree_build(a->positions.data, a->offsets.data, n['B'], center, a->half_width.number,
+                                        (int)a->depth.integer, a->keys.data, a->cell_offsets.data, a->node_cell.data,
+                                        a->node_order.data, a->node_offsets.data, result);
 }
 
 static bool octree_check(const call *c) {
@@ -180,21 +183,21 @@ static bool octree_count(call *c, PyObject *list) {
 }
 
 KERNEL(octree_coordinates, keys, coordinates) {
-  return kernels->octree_coordinates(a->keys.data, n['C'], a->coordinates.data);
+  return chosen_kernels()->octree_coordinates(a->keys.data, n['C'], a->coordinates.data);
 }
 
 KERNEL(octree_coarsen, keys, cell_offsets, levels, coarse_keys, coarse_offsets, first_child, node_cell, pair_offsets,
        fine, coarse, fine_by_fine, coarse_by_fine) {
-  return kernels->octree_coarsen(a->keys.data, a->cell_offsets.data, n['B'], (int)a->levels.integer, result);
+  return chosen_kernels()->octree_coarsen(a->keys.data, a->cell_offsets.data, n['B'], (int)a->levels.integer, result);
 }
 
 static ast_status octree_coarsen_write(const argument *arguments, UNUSED const int64_t *n, void *result) {
   const octree_coarsen_arguments *a = (const void *)arguments;
   const ast_octree_level *level = result;
   memcpy(a->pair_offsets.data, level->pair_offsets, sizeof level->pair_offsets);
-  return kernels->octree_write_level(level, a->coarse_keys.data, a->coarse_offsets.data, a->first_child.data,
-                                     a->node_cell.data, a->fine.data, a->coarse.data, a->fine_by_fine.data,
-                                     a->coarse_by_fine.data);
+  return chosen_kernels()->octree_write_level(level, a->coarse_keys.data, a->coarse_offsets.data, a->first_child.data,
+                                              a->node_cell.data, a->fine.data, a->coarse.data, a->fine_by_fine.data,
+                                              a->coarse_by_fine.data);
 }
 
 /* The outputs of all levels. The list exists before the kernel runs, and arrays are no objects of the garbage
@@ -226,7 +229,7 @@ KERNEL(farthest_point_sample, coordinates, offsets, num, indices, out_offsets) {
     const int64_t points = offsets[b + 1] - offsets[b];
     out[b + 1] = out[b] + (points < num ? points : num);
   }
-  return kernels->farthest_point_sample(a->coordinates.data, offsets, n['B'], num, out, a->indices.data);
+  return chosen_kernels()->farthest_point_sample(a->coordinates.data, offsets, n['B'], num, out, a->indices.data);
 }
 
 static bool farthest_point_sample_count(call *c, PyObject *list) {
@@ -245,13 +248,13 @@ static bool farthest_point_sample_count(call *c, PyObject *list) {
 /* Transposed, the spec gives the axes of the weight the other way round. */
 KERNEL(sparse_conv, x, weight, bias, transposed, pair_offsets, source, destination, out) {
   const ast_pairs pairs = {a->pair_offsets.data, a->source.data, a->destination.data};
-  return kernels->sparse_conv(a->x.data, a->weight.data, a->bias.data, n['I'], n['O'], a->transposed.integer, pairs,
-                              n['R'], a->out.data);
+  return chosen_kernels()->sparse_conv(a->x.data, a->weight.data, a->bias.data, n['I'], n['O'], a->transposed.integer,
+                                       pairs, n['R'], a->out.data);
 }
 
 KERNEL(sparse_conv_weight, x, dout, pair_offsets, source, destination, dweight) {
   const ast_pairs pairs = {a->pair_offsets.data, a->source.data, a->destination.data};
-  return kernels->sparse_conv_weight(a->x.data, a->dout.data, n['I'], n['O'], pairs, a->dweight.data);
+  return chosen_kernels()->sparse_conv_weight(a->x.data, a->dout.data, n['I'], n['O'], pairs, a->dweight.data);
 }
 
 /* ---- attention ---- */
@@ -293,7 +296,7 @@ static ast_attention attention_of(const attention_tokens *x, const attention_res
 static ast_status attention_call(attention_tokens x, const void *rest, const int64_t *n) {
   const attention_rest_arguments *a = rest;
   const ast_attention s = attention_of(&x, a, n);
-  return kernels->attention(&s, x.q.data, x.k.data, x.v.data, a->out.data, a->maximum.data, a->total.data);
+  return chosen_kernels()->attention(&s, x.q.data, x.k.data, x.v.data, a->out.data, a->maximum.data, a->total.data);
 }
 
 static ast_status attention_call_backward(attention_tokens x, const void *rest, attention_tokens d, const int64_t *n) {
@@ -302,8 +305,8 @@ static ast_status attention_call_backward(attention_tokens x, const void *rest, 
   s.dq_stride = d.q.row_stride;
   s.dk_stride = d.k.row_stride;
   s.dv_stride = d.v.row_stride;
-  return kernels->attention_backward(&s, x.q.data, x.k.data, x.v.data, a->out.data, a->maximum.data, a->total.data,
-                                     a->dout.data, d.q.data, d.k.data, d.v.data);
+  return chosen_kernels()->attention_backward(&s, x.q.data, x.k.data, x.v.data, a->out.data, a->maximum.data,
+                                              a->total.data, a->dout.data, d.q.data, d.k.data, d.v.data);
 }
 
 KERNEL(attention, q, k, v, ATTENTION) { return attention_call((attention_tokens){a->q, a->k, a->v}, &a->q_offsets, n); }
@@ -348,14 +351,14 @@ static bool message_check(const call *c) {
 
 KERNEL(message, MESSAGE, sum, messages) {
   const ast_message s = message_of(a, n);
-  return kernels->message(&s, a->sum.data, a->messages.data);
+  return chosen_kernels()->message(&s, a->sum.data, a->messages.data);
 }
 
 KERNEL(message_backward, dsum, dmessages, MESSAGE, dof_senders, dof_receivers, dedge_features, dA1, da1, dA2, dW2, db2,
        dgamma, dbeta) {
   const ast_message s = message_of(&a->of_senders, n);
   const ast_message_gradients gradients = {LIST_OF(GRADIENT, MESSAGE_FLOATS)};
-  return kernels->message_backward(&s, a->dsum.data, a->dmessages.data, &gradients);
+  return chosen_kernels()->message_backward(&s, a->dsum.data, a->dmessages.data, &gradients);
 }
 
 /* ---- dense layers ---- */
@@ -374,14 +377,15 @@ static ast_linear linear_of(const argument *x, const argument *weight, const int
 KERNEL(linear, x, weight, bias, residual, activation, out, z) {
   ast_linear s = linear_of(&a->x, &a->weight, n, a->activation.integer);
   s.residual_stride = a->residual.row_stride;
-  return kernels->linear(&s, a->x.data, a->weight.data, a->bias.data, a->residual.data, a->out.data, a->z.data);
+  return chosen_kernels()->linear(&s, a->x.data, a->weight.data, a->bias.data, a->residual.data, a->out.data,
+                                  a->z.data);
 }
 
 KERNEL(linear_backward, dout, x, weight, bias, z, activation, dx, dweight, dbias) {
   ast_linear s = linear_of(&a->x, &a->weight, n, a->activation.integer);
   s.dout_stride = a->dout.row_stride;
-  return kernels->linear_backward(&s, a->dout.data, a->x.data, a->weight.data, a->bias.data, a->z.data, a->dx.data,
-                                  a->dweight.data, a->dbias.data);
+  return chosen_kernels()->linear_backward(&s, a->dout.data, a->x.data, a->weight.data, a->bias.data, a->z.data,
+                                           a->dx.data, a->dweight.data, a->dbias.data);
 }
 
 #define MLP x, beside, weight1, bias1, weight2, bias2, gamma, beta
@@ -398,14 +402,14 @@ static ast_mlp mlp_of(const void *arguments, const int64_t *n) {
 KERNEL(mlp, MLP, residual, out, MLP_KEPT) {
   ast_mlp s = mlp_of(a, n);
   s.residual_stride = a->residual.row_stride;
-  return kernels->mlp(&s, a->residual.data, a->out.data, (ast_mlp_kept){LIST_OF(FIELD, MLP_KEPT)});
+  return chosen_kernels()->mlp(&s, a->residual.data, a->out.data, (ast_mlp_kept){LIST_OF(FIELD, MLP_KEPT)});
 }
 
 KERNEL(mlp_backward, dout, MLP, MLP_KEPT, dx, dbeside, dweight1, dbias1, dweight2, dbias2, dgamma, dbeta) {
   ast_mlp s = mlp_of(&a->x, n);
   s.dout_stride = a->dout.row_stride;
-  return kernels->mlp_backward(&s, a->dout.data, (ast_mlp_kept){LIST_OF(FIELD, MLP_KEPT)},
-                               (ast_mlp_gradients){LIST_OF(GRADIENT, MLP)});
+  return chosen_kernels()->mlp_backward(&s, a->dout.data, (ast_mlp_kept){LIST_OF(FIELD, MLP_KEPT)},
+                                        (ast_mlp_gradients){LIST_OF(GRADIENT, MLP)});
 }
 
 /* ---- attention blocks ---- */
@@ -426,14 +430,14 @@ static ast_attention_block block_of(const void *arguments, const int64_t *n) {
 
 KERNEL(attention_block, BLOCK_ROWS, BLOCK_WEIGHTS, heads, out, BLOCK_KEPT) {
   const ast_attention_block s = block_of(a, n);
-  return kernels->attention_block(&s, a->out.data, (ast_attention_block_kept){LIST_OF(FIELD, BLOCK_KEPT)});
+  return chosen_kernels()->attention_block(&s, a->out.data, (ast_attention_block_kept){LIST_OF(FIELD, BLOCK_KEPT)});
 }
 
 KERNEL(attention_block_backward, dout, BLOCK_ROWS, BLOCK_WEIGHTS, heads, BLOCK_KEPT, dx, dcontext, dgamma, dbeta,
        dcontext_gamma, dcontext_beta, dquery, dkey_value, dweight, dbias, dinner_gamma, dinner_beta, dfirst,
        dfirst_bias, dsecond, dsecond_bias) {
   const ast_attention_block s = block_of(&a->x, n);
-  return kernels->attention_block_backward(
+  return chosen_kernels()->attention_block_backward(
       &s, a->dout.data, (ast_attention_block_kept){LIST_OF(FIELD, BLOCK_KEPT)},
       (ast_attention_block_gradients){LIST_OF(GRADIENT, x, context), LIST_OF(GRADIENT, BLOCK_WEIGHTS)});
 }

@@ -15,6 +15,9 @@
 
 #include "ast.h"
 #include "gemm.h"
+#ifdef AST_BFLOAT16
+#include "bfloat16.h"
+#endif
 
 enum {
   DENSE_ROWS = 96,         /* rows of a block: a multiple of GEMM_ROWS */
@@ -33,7 +36,7 @@ typedef struct {
   int64_t K, N;       /* paired: outputs of a half */
   bool paired;        /* N outputs beside N others */
   int64_t depth;      /* terms of one chain of multiply-adds */
-  float *panels;      /* [panels][K][GEMM_COLUMNS], */
+  float *panels;      /* [panels][K][GEMM_COLUMNS], or in pairs (bfloat16.h) */
   float *panels_bias; /* [panels][GEMM_COLUMNS] */
 } dense_layer;
 
@@ -47,20 +50,54 @@ AST_INLINE dense_layer dense_backward(const float *weight, int64_t row, int64_t 
 
 AST_INLINE int64_t dense_panel_width(const dense_layer *l) { return l->paired ? VW : GEMM_COLUMNS; }
 AST_INLINE int64_t dense_panels(const dense_layer *l) { return divide_up(l->N, dense_panel_width(l)); }
-AST_INLINE int64_t dense_packed_size(const dense_layer *l) { return dense_panels(l) * (l->K + 1) * GEMM_COLUMNS; }
+#ifdef AST_BFLOAT16
+/* Fewer inputs do not fill a tile: rounding them costs more than it gains. */
+AST_INLINE bool dense_is_rounded(const dense_layer *l) { return l->K >= BFLOAT16_STEP; }
+#endif
+
+/* Floats of a panel. */
+AST_INLINE int64_t dense_panel_size(const dense_layer *l) {
+#ifdef AST_BFLOAT16
+  if (dense_is_rounded(l)) return bfloat16_panel_size(l->K);
+#endif
+  return l->K * GEMM_COLUMNS;
+}
+AST_INLINE float *dense_panel(const dense_layer *l, int64_t p) { return l->panels + p * dense_panel_size(l); }
+AST_INLINE int64_t dense_packed_size(const dense_layer *l) {
+  return dense_panels(l) * (dense_panel_size(l) + GEMM_COLUMNS);
+}
+
+/* n outputs from j on of the inputs k to k + depth. */
+static void dense_pack_inputs(const dense_layer *l, int64_t j, int64_t n, int64_t k, int64_t depth, float *panel) {
+  const float *weight = l->weight + j * l->column + k * l->row;
+  if (l->paired) {
+    gemm_pack_columns(weight, l->row, l->column, depth, n, VW, panel);
+    gemm_pack_columns(weight + l->N * l->column, l->row, l->column, depth, n, VW, panel + VW);
+  } else {
+    gemm_pack_columns(weight, l->row, l->column, depth, n, GEMM_COLUMNS, panel);
+  }
+}
+
+static void dense_pack_outputs(const dense_layer *l, int64_t j, int64_t n, float *panel) {
+#ifdef AST_BFLOAT16
+  for (int64_t k = 0; dense_is_rounded(l) && k < l->K; k += BFLOAT16_STEP) {
+    float step[BFLOAT16_STEP * GEMM_COLUMNS] = {0};
+    dense_pack_inputs(l, j, n, k, min64(BFLOAT16_STEP, l->K - k), step);
+    bfloat16_pack(step, panel + k / 2 * GEMM_COLUMNS);
+  }
+  if (dense_is_rounded(l)) return;
+#endif
+  dense_pack_inputs(l, j, n, 0, l->K, panel);
+}
 
 static void dense_pack_panel(const dense_layer *l, int64_t p) {
-  float *panel = l->panels + p * l->K * GEMM_COLUMNS, *bias = l->panels_bias + p * GEMM_COLUMNS;
+  float *bias = l->panels_bias + p * GEMM_COLUMNS;
   const int64_t j = p * dense_panel_width(l), n = min64(dense_panel_width(l), l->N - j);
-  const float *weight = l->weight + j * l->column;
+  dense_pack_outputs(l, j, n, dense_panel(l, p));
   for (int i = 0; i < GEMM_COLUMNS; i++) bias[i] = 0;
-  if (l->paired) {
-    gemm_pack_columns(weight, l->row, l->column, l->K, n, VW, panel);
-    gemm_pack_columns(weight + l->N * l->column, l->row, l->column, l->K, n, VW, panel + VW);
-    for (int64_t i = 0; l->bias && i < n; i++) bias[i] = l->bias[j + i], bias[VW + i] = l->bias[l->N + j + i];
-  } else {
-    gemm_pack_columns(weight, l->row, l->column, l->K, n, GEMM_COLUMNS, panel);
-    for (int64_t i = 0; l->bias && i < n; i++) bias[i] = l->bias[j + i];
+  for (int64_t i = 0; l->bias && i < n; i++) {
+    bias[i] = l->bias[j + i];
+    if (l->paired) bias[VW + i] = l->bias[l->N + j + i];
   }
 }
 
@@ -88,7 +125,7 @@ static ast_status dense_pack(dense_layer *layers, int64_t num) {
   if (!packed) return AST_NO_MEMORY;
   for (int64_t i = 0; i < num; i++) {
     layers[i].panels = packed;
-    layers[i].panels_bias = packed + dense_panels(&layers[i]) * layers[i].K * GEMM_COLUMNS;
+    layers[i].panels_bias = dense_panel(&layers[i], dense_panels(&layers[i]));
     packed += dense_packed_size(&layers[i]);
   }
   if (size >= DENSE_PACK) return ast_parallel(panels, dense_pack_task, layers);
@@ -168,9 +205,48 @@ AST_INLINE void dense_finish_tile(const int rows, const int vectors, const dense
   TILE_EACH(i, v) vstore(out + i * e->out_row + v * VW, z[i][v]);
 }
 
-/* sum_ij = sum_k a_ik W_jk for a register tile, chain after chain, their sum in the stack between two of them. */
-AST_INLINE void dense_sums(const int rows, const int vectors, const dense_layer *l, gemm_a a, const float *panel,
+/* A block of rows of A, at most DENSE_ROWS, that a layer multiplies panel by panel. */
+typedef struct {
+  const dense_layer *layer;
+  gemm_a a;
+  int64_t rows;
+#ifdef AST_BFLOAT16
+  bfloat16_block rounded;
+#endif
+} dense_block;
+
+AST_INLINE void dense_new_block(dense_block *block, const dense_layer *l, gemm_a a, int64_t rows) {
+  block->layer = l;
+  block->a = a;
+  block->rows = rows;
+#ifdef AST_BFLOAT16
+  block->rounded.k0 = -1;
+#endif
+}
+
+/* Comes before the tiles of panel p. */
+AST_INLINE void dense_begin_panel(dense_block *block, int64_t p) {
+#ifdef AST_BFLOAT16
+  const dense_layer *l = block->layer;
+  if (dense_is_rounded(l)) bfloat16_sums(block->rows, l->K, block->a, dense_panel(l, p), &block->rounded);
+#else
+  (void)block, (void)p;
+#endif
+}
+
+/* sum_ij = sum_k a_ik W_jk for a register tile, rows from i0 on of panel p, chain after chain, their sum in the stack
+ * between two of them. */
+AST_INLINE void dense_sums(const int rows, const int vectors, const dense_block *block, int64_t p, int64_t i0,
                            vf sum[GEMM_ROWS][2]) {
+  const dense_layer *l = block->layer;
+#ifdef AST_BFLOAT16
+  if (dense_is_rounded(l)) {
+    TILE_EACH(i, v) sum[i][v] = vload(block->rounded.sums + (i0 + i) * GEMM_COLUMNS + v * VW);
+    return;
+  }
+#endif
+  const float *panel = dense_panel(l, p);
+  const gemm_a a = {block->a.data + i0 * block->a.row, block->a.row, block->a.column};
   float sums[GEMM_ROWS * GEMM_COLUMNS] __attribute__((aligned(64)));
   for (int64_t k = 0;;) { /* once without inputs, too: the sums are then 0 */
     TILE_EACH(i, v) sum[i][v] = (vf){0};
@@ -186,14 +262,15 @@ AST_INLINE void dense_sums(const int rows, const int vectors, const dense_layer 
 }
 
 /* One register tile: rows i.. of panel p. */
-AST_INLINE void dense_tile(const int rows, const int vectors, const dense_layer *l, int64_t p, int64_t i0, gemm_a a,
+AST_INLINE void dense_tile(const int rows, const int vectors, const dense_block *block, int64_t p, int64_t i0,
                            const dense_end *e) {
+  const dense_layer *l = block->layer;
   const int64_t j = p * dense_panel_width(l);
-  const float *panel = l->panels + p * l->K * GEMM_COLUMNS, *bias = l->panels_bias + p * GEMM_COLUMNS;
+  const float *bias = l->panels_bias + p * GEMM_COLUMNS;
   float sums[GEMM_ROWS * GEMM_COLUMNS] __attribute__((aligned(64)));
   TILE_EACH(i, v) __builtin_prefetch(e->out + (i0 + i) * e->out_row + j + v * VW, 1);
   vf sum[GEMM_ROWS][2];
-  dense_sums(rows, vectors, l, (gemm_a){a.data + i0 * a.row, a.row, a.column}, panel, sum);
+  dense_sums(rows, vectors, block, p, i0, sum);
   if (!l->paired && !e->z && l->N - j >= vectors * VW) {
     dense_finish_tile(rows, vectors, e, i0, j, bias, sum);
     return;
@@ -209,15 +286,15 @@ AST_INLINE void dense_fetch(const dense_next *next, int64_t p, int64_t panels, i
     for (int64_t k = begin; k < end; k++) __builtin_prefetch(next->data + i * next->row + 16 * k, 0, 2);
 }
 
-AST_INLINE void dense_strip(const int vectors, const dense_layer *l, int64_t p, int64_t rows, gemm_a a,
-                            const dense_end *e) {
-#define DENSE_TILE(rows)                                                               \
-  do {                                                                                 \
-    for (int n = 0; n < DENSE_NEXT && (rows) == GEMM_ROWS; n++)                        \
-      if (e->next[n].data) dense_fetch(&e->next[n], p, dense_panels(l), i, GEMM_ROWS); \
-    dense_tile(rows, vectors, l, p, i, a, e);                                          \
+AST_INLINE void dense_strip(const int vectors, const dense_block *block, int64_t p, const dense_end *e) {
+#define DENSE_TILE(rows)                                                      \
+  do {                                                                        \
+    for (int n = 0; n < DENSE_NEXT && (rows) == GEMM_ROWS; n++)               \
+      if (e->next[n].data) dense_fetch(&e->next[n], p, panels, i, GEMM_ROWS); \
+    dense_tile(rows, vectors, block, p, i, e);                                \
   } while (0)
-  EACH_TILE_OF_ROWS(i, rows, DENSE_TILE);
+  const int64_t panels = dense_panels(block->layer);
+  EACH_TILE_OF_ROWS(i, block->rows, DENSE_TILE);
 #undef DENSE_TILE
 }
 
@@ -228,9 +305,12 @@ AST_INLINE int64_t dense_begin(int64_t M, int64_t tasks, int64_t index) {
 
 /* Panels first <= p < last of the layer on `rows` rows of A. */
 static void dense_rows(const dense_layer *l, int64_t first, int64_t last, int64_t rows, gemm_a a, dense_end e) {
+  dense_block block;
+  dense_new_block(&block, l, a, rows);
   for (int64_t p = first; p < last; p++) {
-    if (l->paired || l->N - p * GEMM_COLUMNS > VW) dense_strip(2, l, p, rows, a, &e);
-    else dense_strip(1, l, p, rows, a, &e);
+    dense_begin_panel(&block, p);
+    if (l->paired || l->N - p * GEMM_COLUMNS > VW) dense_strip(2, &block, p, &e);
+    else dense_strip(1, &block, p, &e);
   }
 }
 

@@ -1,5 +1,7 @@
 """The options of `predict` and `sweep` that choose an effort are the numbers of `Effort`."""
 
+from dataclasses import replace
+
 import pytest
 
 from ast_sim import Effort
@@ -25,12 +27,30 @@ def test_options_change_the_default_effort(command):
     assert parsed("--exact", command=command) == Effort.exact()
 
 
+def test_a_precision_changes_nothing_else_of_the_default():
+    assert parsed("--precision", "bfloat16") == Effort(3, 10, precision="bfloat16")
+    assert parsed("--precision", "bfloat16", "--corrections", "1") == Effort(1, 0, precision="bfloat16")
+    assert parsed("--exact", "--precision", "bfloat16") == replace(Effort.exact(), precision="bfloat16")
+    with pytest.raises(ConfigError, match="precision is 'half': choose of float32, bfloat16"):
+        Effort(precision="half")
+
+
 def test_an_exact_answer_takes_no_numbers():
     with pytest.raises(ConfigError, match="needs no numbers: leave --newton-steps out"):
         parsed("--exact", "--newton-steps", "1")
 
 
-@pytest.mark.parametrize("effort", [Effort(), Effort(2, 0), Effort(0, 10), Effort.exact()])
+@pytest.mark.parametrize(
+    "effort",
+    [
+        Effort(),
+        Effort(2, 0),
+        Effort(0, 10),
+        Effort.exact(),
+        Effort(1, 2, precision="bfloat16"),
+        replace(Effort.exact(), precision="bfloat16"),
+    ],
+)
 def test_the_options_of_an_effort_ask_for_it(effort):
     assert parsed(*options_of(effort)) == effort
 

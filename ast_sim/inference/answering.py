@@ -16,6 +16,7 @@ from ast_sim.inference.predicting.rollout import rollouts
 from ast_sim.mechanics.physics_check import turned_over
 from ast_sim.models.model_config import ModelConfig
 from ast_sim.models.simulator import Simulator
+from ast_sim.ops import products_in
 from ast_sim.support.progress import ShowProgress
 
 
@@ -28,11 +29,12 @@ def answers(
     """Predict the wanted frames of several scenes, by jumps or step by step as the model does; see `jumps` and
     `rollouts` for the arguments and errors."""
     began = time.perf_counter()
-    if model.config.scheme.jumps:
-        predicted = jumps(model, questions, effort, progress)
-    else:
-        effort.check(model.config)
-        predicted = rollouts(model, questions, progress)
+    with products_in(effort.precision):
+        if model.config.scheme.jumps:
+            predicted = jumps(model, questions, effort, progress)
+        else:
+            effort.check(model.config)
+            predicted = rollouts(model, questions, progress)
     each = (time.perf_counter() - began) / max(1, len(questions))
     return [dataclasses.replace(answer, seconds=each) for answer in predicted]
 

@@ -15,7 +15,7 @@ from ast_sim.ops._edges import (
 )
 from ast_sim.ops._elastic_forces import TetrahedronSet, elastic_forces
 from ast_sim.ops._fps import farthest_point_sample
-from ast_sim.ops._linear import linear
+from ast_sim.ops._linear import linear, products_in
 from ast_sim.ops._message import message_edges, message_sum
 from ast_sim.ops._mlp import mlp
 from ast_sim.ops._octree import CellMap, Octree, octree
@@ -45,6 +45,7 @@ __all__ = [
     "octree",
     "offsets_of",
     "outer_faces",
+    "products_in",
     "proximity",
     "rotated",
     "segment_mean",

@@ -1,19 +1,26 @@
-"""One dense layer with its activation and a residual.
+"""One dense layer with its activation and a residual, and the precision in which dense layers multiply.
 
 Legend: M rows, I inputs, O outputs.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from ast_sim.ops import library
 from ast_sim.ops.derivatives import gradient_op
 from ast_sim.ops.library import Kernel, Op, is_at_most
+from ast_sim.support.errors import ConfigError, warn
+from ast_sim.support.precisions import PRECISIONS, Precision
 
 ACTIVATIONS = ("none", "relu", "geglu")
 RELU, GEGLU = 1, 2  # as numbers
+_FASTER = library.configuration()["bfloat16"] is not None  # in bfloat16
 SAVED = 1 << 24  # an activation's input with more elements is not kept for the gradient, but computed again
 
 
@@ -85,3 +92,31 @@ def linear(
         save = small and torch.is_grad_enabled() and any(y is not None and y.requires_grad for y in (x, weight, bias))
     op = _geglu if activation == "geglu" else _linear
     return op(x, weight, bias, residual, ACTIVATIONS.index(activation), save)[0]
+
+
+@contextmanager
+def products_in(precision: Precision) -> Iterator[None]:
+    """Dense layers of this thread multiply in this precision meanwhile.
+
+    With "bfloat16" `linear`, `mlp`, `message_sum`, `message_edges`, `attention_block` and their gradients round both
+    factors of a product of at least 32 inputs to 8 binary digits; sums, activations and the gradients of weights stay
+    in float32. All results depend on neither threads nor batch, as in float32.
+
+    Warns, and changes nothing, where the processor multiplies no faster in bfloat16 (it has neither AMX nor, from AMD,
+    AVX512-BF16), and where AST_SIM_ISA or AST_SIM_BACKEND chooses other kernels.
+
+    Raises:
+        ConfigError: there is no such precision.
+    """
+    if precision not in PRECISIONS:
+        raise ConfigError(f"precision is {precision!r}: choose of {', '.join(PRECISIONS)}")
+    if not _FASTER:
+        if precision != "float32":
+            warn("this processor is no faster in bfloat16, or its kernels were not chosen: float32 is used")
+        yield
+        return
+    before = library._C.multiply_in_bfloat16(precision == "bfloat16")
+    try:
+        yield
+    finally:
+        library._C.multiply_in_bfloat16(before)

@@ -286,8 +286,7 @@ def is_at_most(size: int, most: int) -> bool:
 def frozen(*indices: Tensor) -> tuple[Tensor, ...]:
     """Copies of int64 tensors that the C core trusts: from the first call on it keeps the values, and checks them once.
 
-    So nobody should write to the copies: no op would see it after the first. Other tensors are copied and checked in
-    every call.
+    So nobody should write to the copies: no op would see it. Other tensors are copied and checked in every call.
     """
     if BACKEND == "torch" or torch.compiler.is_compiling() or torch._C._len_torch_dispatch_stack() > 0:
         return indices
@@ -320,6 +319,7 @@ def configuration() -> dict:
         "backend": BACKEND,
         "instruction_set": core.get("isa", "-"),
         "supported": core.get("supported", []),
+        "bfloat16": core.get("bfloat16"),
         "threads": torch.get_num_threads(),
         "core_threads": core.get("threads", 0),
         "debug": core.get("debug", False),

@@ -10,6 +10,7 @@ from ast_sim.models.data_facts import DataFacts
 from ast_sim.models.model_config import ModelConfig, setting
 from ast_sim.models.registry import find_model
 from ast_sim.support.errors import ConfigError, is_utf8
+from ast_sim.support.precisions import Precision
 
 OptimizerName = Literal["adamw", "muon"]
 
@@ -42,6 +43,11 @@ class TrainConfig:
     decay: int | None = setting(
         None,
         "step at which the learning rate reaches 0; unset: the last step, or one epoch later if `steps` is unset",
+    )
+    precision: Precision = setting(
+        "float32",
+        "in which dense layers multiply; bfloat16 keeps 8 binary digits of each factor of a product, on processors that"
+        " are faster so; sums and the gradients of weights stay in float32",
     )
     clip: float = setting(1.0, "largest norm of the gradient; a longer gradient is scaled down to it")
     noise: float | None = setting(

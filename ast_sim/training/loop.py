@@ -24,6 +24,7 @@ from ast_sim.models.node_inputs import with_proximity
 from ast_sim.models.registry import build_model
 from ast_sim.models.simulator import Simulator
 from ast_sim.number_arrays import percent
+from ast_sim.ops import products_in
 from ast_sim.runs import checkpoint
 from ast_sim.runs.folder import RunFolder
 from ast_sim.runs.train_config import RunConfig, TrainConfig
@@ -209,7 +210,9 @@ class Training:
         for part in range(options.accumulate):
             number = self.step * options.accumulate + part
             batch, target = self.ahead.batch(number)
-            for key, value in self._add_gradient(number, batch, target).items():
+            with products_in(options.precision):
+                losses = self._add_gradient(number, batch, target)
+            for key, value in losses.items():
                 values[key] = values.get(key, 0.0) + value / options.accumulate
             names += batch.names
         self.processes.add(self.optimizer.gradient)

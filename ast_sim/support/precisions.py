@@ -1,0 +1,6 @@
+"""The precisions in which dense layers multiply."""
+
+from typing import Literal, get_args
+
+Precision = Literal["float32", "bfloat16"]
+PRECISIONS: tuple[Precision, ...] = get_args(Precision)

@@ -1,0 +1,28 @@
+/* The kernels that are made of dense layers, with products in bfloat16: a table whose other kernels are NULL.
+ * isa_amx.c and isa_avx512_bf16.c name the set of instructions and include this file. */
+#define AST_BFLOAT16
+#include "attention.c"
+#include "attention_backward.c"
+#include "linear.c"
+#include "attention_block.c" /* after attention.c and linear.c, of which it is made */
+#include "message.c"
+#include "message_backward.c" /* after message.c, whose tiles it uses */
+#include "mlp.c"
+
+#define AST_TABLE_OF(isa)  ast_kernels_##isa
+#define AST_TABLE(isa)     AST_TABLE_OF(isa)
+#define AST_STRING_OF(isa) #isa
+#define AST_STRING(isa)    AST_STRING_OF(isa)
+
+extern const ast_kernels AST_TABLE(AST_ISA);
+
+const ast_kernels AST_TABLE(AST_ISA) = {.isa = AST_STRING(AST_ISA),
+                                        .vector_bytes = AST_VECTOR_BYTES,
+                                        .attention_block = attention_block,
+                                        .attention_block_backward = attention_block_backward,
+                                        .linear = linear,
+                                        .linear_backward = linear_backward,
+                                        .message = message,
+                                        .message_backward = message_backward,
+                                        .mlp = mlp,
+                                        .mlp_backward = mlp_backward};

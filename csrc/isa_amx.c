@@ -1,0 +1,2 @@
+#define AST_ISA amx
+#include "bfloat16_kernels.c"
