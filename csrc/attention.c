@@ -23,6 +23,9 @@
 #include "ast.h"
 #include "attention_tiles.h"
 #include "dropout.h"
+#ifdef AST_BFLOAT16
+#include "attention_bfloat16.h"
+#endif
 
 enum {
   QUERIES = 512,     /* of a task, which share the copies of its keys; the panels stay in the second cache */
@@ -63,6 +66,10 @@ typedef struct {
   float queries[QUERIES * MAX_D]; /* scale Q in panels, */
   float scale;                    /* or Q and the scale of its scores, which is 1 otherwise */
   float out[QUERIES * ROW], maximum[QUERIES], sum[QUERIES], unit;
+#ifdef AST_BFLOAT16
+  float query_pairs[QUERIES / 2 * (MAX_D + BFLOAT16_STEP)];
+  attention_rounded rounded;
+#endif
 } attention_forward_scratch;
 
 /* The scene, head, queries and keys of a task. */
@@ -73,6 +80,28 @@ typedef struct {
 } attention_forward_range;
 
 /* ---- a panel against a block of keys ---- */
+
+/* Scores of n keys against the queries i0..i0+LANES, and their maximum; later out[query] = fade[query] out[query] + the
+ * values weighted by what became of the scores, or these alone without fade. */
+#ifdef AST_BFLOAT16
+static void attention_panel_scores(attention_forward_scratch *t, int64_t i0, int64_t n, int64_t D, vf largest[2]) {
+  const float *pairs = t->query_pairs + i0 / 2 * round_up(D, BFLOAT16_STEP);
+  attention_rounded_scores(n, D, pairs, &t->rounded, t->scores, largest);
+}
+static void attention_panel_product(attention_forward_scratch *t, int64_t rows, int64_t n, int64_t D, float *out,
+                                    const float *fade) {
+  (void)rows;
+  attention_rounded_product(D, n, t->scores, &t->rounded, out, fade);
+}
+#else
+static void attention_panel_scores(attention_forward_scratch *t, int64_t i0, int64_t n, int64_t D, vf largest[2]) {
+  attention_scores(round_up(n, ROW_STEP), D, t->keys, t->queries + i0 * D, t->scores, largest);
+}
+static void attention_panel_product(attention_forward_scratch *t, int64_t rows, int64_t n, int64_t D, float *out,
+                                    const float *fade) {
+  attention_faded_product(round_up(rows, ROW_STEP), D, n, t->scores, t->values, out, fade);
+}
+#endif
 
 /* Scores x become exp(x - base) 2^-shift; their sums over the n keys. */
 AST_INLINE void attention_weights(float *x, int64_t n, const vf base[2], int32_t shift, vf sum[2]) {
@@ -118,9 +147,8 @@ static void attention_forward_panel(attention_forward_scratch *t, const attentio
                                     int64_t rows, int64_t query, int64_t k0, int64_t n, int64_t D, int32_t shift,
                                     bool first, const dropout *d) {
   float *m = state->maximum + i0, *l = state->sum + i0, fade[LANES];
-  const float *queries = t->queries + i0 * D;
   vf largest[2] = {vsplat(-INFINITY), vsplat(-INFINITY)}, base[2], sum[2] = {{0}};
-  attention_scores(round_up(n, ROW_STEP), D, t->keys, queries, t->scores, largest);
+  attention_panel_scores(t, i0, n, D, largest);
   if (t->scale != 1) attention_scale_scores(n, t->scale, t->scores, largest);
   EACH(2, c) {
     const vf before = vload(m + c * VW), now = vmax(largest[c], before);
@@ -135,8 +163,7 @@ static void attention_forward_panel(attention_forward_scratch *t, const attentio
     attention_weights(t->scores, n, base, shift, sum);
   }
   EACH(2, c) vstore(l + c * VW, vload(l + c * VW) * vload(fade + c * VW) + sum[c]);
-  attention_faded_product(round_up(rows, ROW_STEP), D, n, t->scores, t->values, state->out + i0 * ROW,
-                          first ? NULL : fade);
+  attention_panel_product(t, rows, n, D, state->out + i0 * ROW, first ? NULL : fade);
 }
 
 /* Whether one of the n rows has a number of larger magnitude. */
@@ -241,6 +268,10 @@ static ast_status attention_forward_task(int64_t index, void *context) {
   for (int64_t p = 0; p < panels; p++)
     attention_pack_panel(job->q + (q0 + p * LANES) * s->q_stride + h * D, s->q_stride, rows - p * LANES, D,
                          attention_scale_of_queries(s->scale), t->queries + p * LANES * D);
+#ifdef AST_BFLOAT16
+  for (int64_t p = 0; p < panels; p++)
+    attention_round_queries(t->queries + p * LANES * D, D, t->query_pairs + p * LANES / 2 * round_up(D, BFLOAT16_STEP));
+#endif
   t->scale = attention_scale_of_scores(s->scale);
   attention_fill_rows(0, 0, 1, panels * LANES, state.sum);
   attention_fill_rows(-INFINITY, 0, 1, panels * LANES, state.maximum);
@@ -250,6 +281,9 @@ static ast_status attention_forward_task(int64_t index, void *context) {
     const float *k = job->k + row * s->k_stride + h * D, *v = job->v + row * s->v_stride + h * D;
     attention_copy_rows(k, s->k_stride, n, D, 1, t->keys);
     attention_copy_rows(v, s->v_stride, n, D, 1, t->values);
+#ifdef AST_BFLOAT16
+    attention_round_block(n, D, t->keys, t->values, &t->rounded);
+#endif
     if (*state.unit < 1 && attention_holds_larger(t->values, n, D, ldexpf(FLT_MAX, -LIFT - task.shift)))
       attention_set_unit(&state, k0 ? panels * LANES : 0, D, ldexpf(1, task.shift));
     for (int64_t p = 0; p < panels; p++) {

@@ -85,8 +85,8 @@ AST_INLINE void attention_faded_strip(const int vectors, int64_t M, int64_t K, c
 }
 
 /* The same for C [M,N], N a multiple of VW. */
-static void attention_faded_product(int64_t M, int64_t N, int64_t K, const float *a, const float *b, float *c,
-                                    const float *factor) {
+static inline void attention_faded_product(int64_t M, int64_t N, int64_t K, const float *a, const float *b, float *c,
+                                           const float *factor) {
   for (int64_t j = 0; j < N; j += GEMM_COLUMNS) {
     if (N - j >= GEMM_COLUMNS) attention_faded_strip(2, M, K, a, b + j, c + j, factor);
     else attention_faded_strip(1, M, K, a, b + j, c + j, factor);

@@ -43,13 +43,20 @@ AST_INLINE vi bfloat16_of(vf x) {
 }
 
 /* Pairs of r(even) in the lower and r(odd) in the upper halves. */
-AST_INLINE vi bfloat16_pairs(vf even, vf odd) { return (vi)((vu)bfloat16_of(even) >> 16) | bfloat16_of(odd); }
+AST_INLINE vi bfloat16_pairs(vf even, vf odd) {
+#ifdef __AVX512BF16__
+  const vi order = LANE_INDICES | (LANE_INDICES + 16) << 16;
+  return (vi)_mm512_permutexvar_epi16((__m512i)order, (__m512i)_mm512_cvtne2ps_pbh((__m512)odd, (__m512)even));
+#else
+  return (vi)((vu)bfloat16_of(even) >> 16) | bfloat16_of(odd);
+#endif
+}
 
-/* One step of a panel from the same one in float32, [BFLOAT16_STEP][GEMM_COLUMNS]. */
-static void bfloat16_pack(const float *step, float *panel) {
-  for (int64_t k = 0; k < BFLOAT16_STEP; k += 2, step += 2 * GEMM_COLUMNS)
+/* One step of a panel from the same one in float32, BFLOAT16_STEP rows of GEMM_COLUMNS, `row` floats apart. */
+AST_INLINE void bfloat16_pack(const float *step, int64_t row, float *panel) {
+  for (int64_t k = 0; k < BFLOAT16_STEP; k += 2, step += 2 * row)
     for (int64_t j = 0; j < GEMM_COLUMNS; j += VW)
-      vstore(panel + k / 2 * GEMM_COLUMNS + j, (vf)bfloat16_pairs(vload(step + j), vload(step + GEMM_COLUMNS + j)));
+      vstore(panel + k / 2 * GEMM_COLUMNS + j, (vf)bfloat16_pairs(vload(step + j), vload(step + row + j)));
 }
 
 /* to[k] = r(from[k]) for k < n, and 0 up to a whole step. */
@@ -82,10 +89,11 @@ enum { BFLOAT16_TILE = 16 }; /* rows of a tile */
 #define BFLOAT16_FENCE() __asm__ volatile("" ::: "memory")
 
 /* `count`, 1 or 2, tiles of rows by both tiles of a panel, over n inputs; added to the sums, or as the sums. */
-AST_INLINE void bfloat16_multiply(const int count, int64_t n, const uint16_t *a, const float *panel, float *sums,
-                                  bool add) {
-  const int64_t row = sizeof *a * BFLOAT16_ROW, line = sizeof *sums * GEMM_COLUMNS;
-  float *const lower = sums + BFLOAT16_TILE * GEMM_COLUMNS;
+AST_INLINE void bfloat16_multiply(const int count, int64_t n, const uint16_t *a, int64_t a_row, const float *panel,
+                                  float *sums, int64_t sums_row, bool add) {
+  const int64_t row = (int64_t)sizeof *a * a_row, pairs = sizeof *panel * GEMM_COLUMNS;
+  const int64_t line = (int64_t)sizeof *sums * sums_row;
+  float *const lower = sums + BFLOAT16_TILE * sums_row;
   if (add) {
     _tile_loadd(0, sums, line);
     _tile_loadd(1, sums + VW, line);
@@ -101,12 +109,12 @@ AST_INLINE void bfloat16_multiply(const int count, int64_t n, const uint16_t *a,
   }
   for (int64_t k = 0; k < n; k += BFLOAT16_STEP, panel += BFLOAT16_STEP / 2 * GEMM_COLUMNS) {
     _tile_loadd(4, a + k, row);
-    _tile_loadd(6, panel, line);
-    _tile_loadd(7, panel + VW, line);
+    _tile_loadd(6, panel, pairs);
+    _tile_loadd(7, panel + VW, pairs);
     _tile_dpbf16ps(0, 4, 6);
     _tile_dpbf16ps(1, 4, 7);
     if (count == 2) {
-      _tile_loadd(5, a + BFLOAT16_TILE * BFLOAT16_ROW + k, row);
+      _tile_loadd(5, a + BFLOAT16_TILE * a_row + k, row);
       _tile_dpbf16ps(2, 5, 6);
       _tile_dpbf16ps(3, 5, 7);
     }
@@ -120,15 +128,16 @@ AST_INLINE void bfloat16_multiply(const int count, int64_t n, const uint16_t *a,
 }
 
 /* Whole tiles: the rows behind the last one have any values. */
-static void bfloat16_products(int64_t rows, int64_t n, const uint16_t *a, const float *panel, float *sums, bool add) {
+static void bfloat16_products(int64_t rows, int64_t n, const uint16_t *a, int64_t a_row, const float *panel,
+                              float *sums, int64_t sums_row, bool add) {
   bfloat16_tiles shape = {.palette = 1};
   for (int i = 0; i < 8; i++) shape.bytes[i] = 64, shape.rows[i] = BFLOAT16_TILE;
   BFLOAT16_FENCE();
   _tile_loadconfig(&shape);
   int64_t i = 0;
   for (; rows - i > BFLOAT16_TILE; i += 2 * BFLOAT16_TILE)
-    bfloat16_multiply(2, n, a + i * BFLOAT16_ROW, panel, sums + i * GEMM_COLUMNS, add);
-  if (i < rows) bfloat16_multiply(1, n, a + i * BFLOAT16_ROW, panel, sums + i * GEMM_COLUMNS, add);
+    bfloat16_multiply(2, n, a + i * a_row, a_row, panel, sums + i * sums_row, sums_row, add);
+  if (i < rows) bfloat16_multiply(1, n, a + i * a_row, a_row, panel, sums + i * sums_row, sums_row, add);
   _tile_release();
   BFLOAT16_FENCE();
 }
@@ -146,24 +155,26 @@ AST_INLINE vf bfloat16_add(vf sum, int32_t pair, vi panel) {
 #endif
 }
 
-AST_INLINE void bfloat16_tile(const int rows, int64_t n, const uint16_t *a, const float *panel, float *sums, bool add) {
+AST_INLINE void bfloat16_tile(const int rows, int64_t n, const uint16_t *a, int64_t a_row, const float *panel,
+                              float *sums, int64_t sums_row, bool add) {
   const int vectors = 2;
   vf sum[GEMM_ROWS][2];
-  TILE_EACH(i, v) sum[i][v] = add ? vload(sums + i * GEMM_COLUMNS + v * VW) : (vf){0};
+  TILE_EACH(i, v) sum[i][v] = add ? vload(sums + i * sums_row + v * VW) : (vf){0};
   for (int64_t k = 0; k < n; k += 2, panel += GEMM_COLUMNS) {
     vi b[2];
     EACH(vectors, v) b[v] = (vi)vload(panel + v * VW);
     EACH(rows, i) {
       int32_t pair;
-      memcpy(&pair, a + i * BFLOAT16_ROW + k, sizeof pair);
+      memcpy(&pair, a + i * a_row + k, sizeof pair);
       EACH(vectors, v) sum[i][v] = bfloat16_add(sum[i][v], pair, b[v]);
     }
   }
-  TILE_EACH(i, v) vstore(sums + i * GEMM_COLUMNS + v * VW, sum[i][v]);
+  TILE_EACH(i, v) vstore(sums + i * sums_row + v * VW, sum[i][v]);
 }
 
-static void bfloat16_products(int64_t rows, int64_t n, const uint16_t *a, const float *panel, float *sums, bool add) {
-#define BFLOAT16_TILE(rows) bfloat16_tile(rows, n, a + i * BFLOAT16_ROW, panel, sums + i * GEMM_COLUMNS, add)
+static void bfloat16_products(int64_t rows, int64_t n, const uint16_t *a, int64_t a_row, const float *panel,
+                              float *sums, int64_t sums_row, bool add) {
+#define BFLOAT16_TILE(rows) bfloat16_tile(rows, n, a + i * a_row, a_row, panel, sums + i * sums_row, sums_row, add)
   EACH_TILE_OF_ROWS(i, rows, BFLOAT16_TILE);
 #undef BFLOAT16_TILE
 }
@@ -177,7 +188,8 @@ static void bfloat16_sums(int64_t rows, int64_t K, gemm_a a, const float *panel,
     if (block->k0 != k0)
       for (int64_t i = 0; i < rows; i++) bfloat16_round_row(a.data + i * a.row + k0, n, block->rows + i * BFLOAT16_ROW);
     block->k0 = k0;
-    bfloat16_products(rows, round_up(n, BFLOAT16_STEP), block->rows, panel + k0 / 2 * GEMM_COLUMNS, block->sums, k0);
+    bfloat16_products(rows, round_up(n, BFLOAT16_STEP), block->rows, BFLOAT16_ROW, panel + k0 / 2 * GEMM_COLUMNS,
+                      block->sums, GEMM_COLUMNS, k0);
   }
 }
 

@@ -1,4 +1,4 @@
-/* The kernels that are made of dense layers, with products in bfloat16: a table whose other kernels are NULL.
+/* Attention and the kernels that are made of dense layers, with products in bfloat16: the others of the table are NULL.
  * isa_amx.c and isa_avx512_bf16.c name the set of instructions and include this file. */
 #define AST_BFLOAT16
 #include "attention.c"
@@ -18,6 +18,8 @@ extern const ast_kernels AST_TABLE(AST_ISA);
 
 const ast_kernels AST_TABLE(AST_ISA) = {.isa = AST_STRING(AST_ISA),
                                         .vector_bytes = AST_VECTOR_BYTES,
+                                        .attention = attention,
+                                        .attention_backward = attention_backward,
                                         .attention_block = attention_block,
                                         .attention_block_backward = attention_block_backward,
                                         .linear = linear,

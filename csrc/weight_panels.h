@@ -83,7 +83,7 @@ static void dense_pack_outputs(const dense_layer *l, int64_t j, int64_t n, float
   for (int64_t k = 0; dense_is_rounded(l) && k < l->K; k += BFLOAT16_STEP) {
     float step[BFLOAT16_STEP * GEMM_COLUMNS] = {0};
     dense_pack_inputs(l, j, n, k, min64(BFLOAT16_STEP, l->K - k), step);
-    bfloat16_pack(step, panel + k / 2 * GEMM_COLUMNS);
+    bfloat16_pack(step, GEMM_COLUMNS, panel + k / 2 * GEMM_COLUMNS);
   }
   if (dense_is_rounded(l)) return;
 #endif

@@ -11,7 +11,7 @@ from ast_sim.support.errors import ConfigError
 from ast_sim.support.precisions import PRECISIONS
 
 PRECISION = (
-    "in which the dense layers of the model multiply: bfloat16 keeps 8 binary digits of each factor and saves time in"
+    "in which the model multiplies: bfloat16 keeps 8 binary digits of each factor and saves time in"
     " large scenes on some processors (default: float32)"
 )
 EXACT = "let the solver continue from the answer of the run (with friction: from rest) until its stop test holds"

@@ -45,8 +45,8 @@ class Effort:
             Stress then follows from the material.
         solved: the bundled solver then goes on to its own stop test; with friction, and where bodies still overlap, it
             follows the load path from rest, frame by frame, as if there were no model.
-        precision: in which the dense layers of the model multiply: "bfloat16" rounds both factors of a product to 8
-            binary digits, which saves time in large scenes on some processors (`ast_sim.ops.products_in`).
+        precision: in which the model multiplies: "bfloat16" rounds both factors of a product to 8 binary digits, which
+            saves time in large scenes on some processors (`ast_sim.ops.products_in`).
 
     Raises:
         ConfigError: a number is not whole or negative, or there is no such precision.

@@ -46,7 +46,7 @@ class TrainConfig:
     )
     precision: Precision = setting(
         "float32",
-        "in which dense layers multiply; bfloat16 keeps 8 binary digits of each factor of a product, on processors that"
+        "in which the model multiplies; bfloat16 keeps 8 binary digits of each factor of a product, on processors that"
         " are faster so; sums and the gradients of weights stay in float32",
     )
     clip: float = setting(1.0, "largest norm of the gradient; a longer gradient is scaled down to it")

@@ -1,4 +1,4 @@
-"""The precisions in which dense layers multiply."""
+"""The precisions in which ops multiply."""
 
 from typing import Literal, get_args
 

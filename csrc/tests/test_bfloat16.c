@@ -108,6 +108,48 @@ static void test_exact_factors(const ast_kernels *low, const ast_kernels *full) 
 
 /* ---- factors that are rounded ---- */
 
+/* Two scenes, the second one with a third of the queries and keys: errors of half a per cent, as weights and values have
+ * 8 binary digits; dropped weights are the same. */
+static void check_attention(const ast_kernels *low, const ast_kernels *full, int64_t queries, int64_t keys, int64_t D,
+                            float dropout) {
+  const int64_t H = 2, q_offsets[] = {0, queries, queries + queries / 3}, k_offsets[] = {0, keys, keys + keys / 3},
+                rows = queries + queries / 3;
+  const ast_attention s = {.B = 2,
+                           .H = H,
+                           .D = D,
+                           .q_offsets = q_offsets,
+                           .k_offsets = k_offsets,
+                           .q_stride = H * D,
+                           .k_stride = H * D,
+                           .v_stride = H * D,
+                           .scale = 1 / sqrtf((float)D),
+                           .dropout_p = dropout};
+  float *q = random_floats(rows * H * D), *k = scaled_floats((keys + keys / 3) * H * D, 3),
+        *v = random_floats((keys + keys / 3) * H * D);
+  float *out[2], *maximum[2], *sum[2];
+  for (int i = 0; i < 2; i++) {
+    out[i] = new_floats(rows * H * D), maximum[i] = new_floats(rows * H), sum[i] = new_floats(rows * H);
+    CHECK((i ? full : low)->attention(&s, q, k, v, out[i], maximum[i], sum[i]) == AST_OK, "status");
+  }
+  double error = 0, size = 0;
+  for (int64_t i = 0; i < (keys < 3 ? queries : rows) * H * D; i++) { /* a scene without keys gives 0 */
+    error += pow((double)out[0][i] - (double)out[1][i], 2);
+    size += pow((double)out[1][i], 2);
+  }
+  CHECK(error <= 0.01 * 0.01 * size, "attention of %lld x %lld x %lld is off by %g", (long long)queries,
+        (long long)keys, (long long)D, sqrt(error / size));
+  for (int i = 0; i < 2; i++) FREE(out[i], maximum[i], sum[i]);
+  FREE(q, k, v);
+}
+
+static void test_attention(const ast_kernels *low, const ast_kernels *full) {
+  static const int64_t sizes[][3] = {{1, 1, 16},    {5, 2, 32},     {33, 127, 48},
+                                     {90, 129, 32}, {31, 300, 128}, {600, 40, 80}};
+  for (size_t i = 0; i < sizeof sizes / sizeof *sizes; i++)
+    check_attention(low, full, sizes[i][0], sizes[i][1], sizes[i][2], i % 2 ? 0.25f : 0);
+  check_attention(low, full, 4, 5000, 32, 0); /* parts, which are merged */
+}
+
 static void test_rounding(const ast_kernels *low) {
   const int64_t M = 130, I = 700, O = 50;
   const ast_linear s = {M, I, O, I, I, O, O, AST_IDENTITY};
@@ -164,6 +206,7 @@ static void test(const ast_kernels *low, const ast_kernels *full) {
     buffers_at_start = threaded;
     if (threaded) pool_start(CHECK_THREADS);
     test_exact_factors(low, full);
+    test_attention(low, full);
     test_rounding(low);
     test_subnormal(low);
     test_rows_alone(low);

@@ -64,7 +64,18 @@ def message_case():
     return fused, composed, inputs
 
 
-CASES = {"linear": linear_case, "mlp": mlp_case, "message": message_case}
+def attention_case():
+    q, k, v = (4 * normal(rows, 2, 32, seed=rows) for rows in (333, 150, 151))
+    offsets = torch.tensor([0, 133, 333]), torch.tensor([0, 20, 150])
+    plain = (*offsets, 32**-0.5, 0.0, 0)
+    return (
+        lambda q, k, v: _attention.attention(q, k, v, *offsets)[0],
+        lambda q, k, v: _attention._reference(q, k, v, *plain)[0],
+        [q, k, v[:150]],
+    )
+
+
+CASES = {"linear": linear_case, "mlp": mlp_case, "message": message_case, "attention": attention_case}
 
 
 def off(results: list[Tensor], exact: list[Tensor]) -> list[float]:
