@@ -63,8 +63,8 @@ static bool message_new_tile(const message_weights *w, message_tile *t) {
   return true;
 }
 
-/* One register tile of x: channels of panel p of the edges from the i0-th of a block on. P + Q comes last: large values cost the product
- * no digits. Latents stand where the sums of the product would. */
+/* One register tile of x: channels of panel p of the edges from the i0-th of a block on. P + Q comes last: large values
+ * cost the product no digits. Latents stand where the sums of the product would. */
 AST_INLINE void message_first_tile(const int rows, const int vectors, const message_weights *w,
                                    const dense_block *block, int64_t p, int64_t first, int64_t i0, float *x) {
   const ast_message *s = w->step;

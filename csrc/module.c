@@ -140,7 +140,7 @@ static PyObject *multiply_in_bfloat16(PyObject *self, PyObject *wanted) {
   return PyBool_FromLong(before);
 }
 
-/* The float32 kernels, with those of another table in their place where it has some. */
+/* The float32 kernels; where another table has a kernel, it takes the place. */
 static void prepare_bfloat16(const ast_kernels *table) {
   if (!table) return;
   bfloat16_kernels = *float32_kernels;

@@ -186,7 +186,10 @@ def test_objects_that_cannot_be(make, text):
 
 
 def test_whole_numbers_of_numpy_become_plain_ones():
-    assert repr(Effort(np.int64(2), np.int32(1))) == "Effort(corrections=2, newton_steps=1, solved=False)"
+    assert (
+        repr(Effort(np.int64(2), np.int32(1)))
+        == "Effort(corrections=2, newton_steps=1, solved=False, precision='float32')"
+    )
 
 
 def test_marks_of_a_mesh(scene):

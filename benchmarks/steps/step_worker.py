@@ -21,7 +21,7 @@ from torch.utils.flop_counter import FlopCounterMode
 import ast_sim
 from ast_sim.batches.batch_builder import Batch, State
 from ast_sim.dataset.reader import Dataset
-from ast_sim.ops import library
+from ast_sim.ops import library, products_in
 from ast_sim.runs.folder import RunFolder
 from ast_sim.support.stop_signals import StopSignals
 from ast_sim.training.configure import configure
@@ -77,7 +77,8 @@ def rollout_step(training: Training) -> Callable[[], object]:
 
     def step() -> None:
         batch = Batch.build(graph, State(first, None, stress), second, ["test/000000 frame 0"])
-        training.model.advance(batch, second)
+        with products_in(training.options.precision):
+            training.model.advance(batch, second)
 
     return step
 

@@ -15,12 +15,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 import ast_sim
 from ast_sim.ops.library import configuration
-from ast_sim.support.precisions import PRECISIONS, Precision
+from ast_sim.support.precisions import PRECISIONS
 from benchmarks.kernels.targets import GIGABYTE
 from benchmarks.steps import before_after, newton, predictions, scenes
 from benchmarks.steps.before_after import median_ratio
@@ -213,31 +212,27 @@ def _large(data: Path, place: Place, what: str) -> tuple[float, int]:
 
 
 def precision(place: Place) -> Iterator[Record]:
-    """One call for a new plate of 12,195 nodes on one thread, in both precisions, in turns."""
-    run, threads = ast_sim.example_run("plates"), torch.get_num_threads()
-    plate = ast_sim.plate((0.48, 0.32, 0.02), cells=(79, 50, 2))
-    punch = ast_sim.box((-0.05, -0.05, 0.018), (0.05, 0.05, 0.118), cells=(2, 2, 2))
-    bodies = ast_sim.Scene.join(plate, punch).to_meshio()
-    scene = ast_sim.read_scene(bodies, obstacles=[1], clamps=["0:xmin,xmax"]).scene
-    seconds: dict[Precision, list[float]] = {name: [] for name in PRECISIONS}
-    positions = {}
-    torch.set_num_threads(1)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the mesh is finer than in training
-        for _ in range(place.repeats + 1):
-            for name, times in seconds.items():
-                new, effort = replace(scene), ast_sim.Effort(precision=name)
-                began = time.perf_counter()
-                answer = run.predict(new, {1: (0, 0, -0.04)}, frames=-1, effort=effort, progress=False)
-                times.append(time.perf_counter() - began)
-                positions[name] = answer.displacement[0]
-    torch.set_num_threads(threads)
-    plain, low = (times[1:] for times in seconds.values())
-    apart = np.linalg.norm(positions["bfloat16"] - positions["float32"]) / np.linalg.norm(positions["float32"])
+    """Calls of a model and training steps in both precisions, on one thread."""
     kernels = configuration()["bfloat16"] or "this processor is no faster"
-    note = f"{_both(plain, low)}, {100 * apart:.2g} % apart, by {kernels}"
-    what = f"bfloat16 beside float32, one call for a new plate of {scene.num_nodes:,} nodes, one thread"
-    yield Record(what, median_ratio(plain, low), "times", 1.3, note=note)
+    for name, what, least in (
+        ("abcd_xl_12k", "rollout", 1.3),
+        ("abcd_xl_12k", "step", 1),
+        ("deforming_plate", "step", 1),
+        ("tiny", "step", 1),
+    ):
+        case = scenes.make(name, place.folder)
+        with ExitStack() as stack:
+            workers = {}
+            for kind in PRECISIONS:
+                settings = [*case.settings, f"train.precision={kind}"]
+                setup = Setup(str(case.data), "ast", case.preset, settings, str(place.folder))
+                workers[kind] = Worker("c", 1, setup, place.folder / f"{kind}.log")
+                stack.callback(workers[kind].close)
+                workers[kind].ask(what, case.steps)  # fills caches
+            plain, low = in_turns(workers, what, case.steps, min(place.repeats, case.most_repeats)).values()
+        one = "one call" if what == "rollout" else "training steps"
+        told = f"bfloat16 beside float32, {one} of {_title(case)}, one thread"
+        yield Record(told, median_ratio(plain, low), "times", least, note=f"{_both(plain, low)}, {kernels}")
 
 
 MEASUREMENTS: dict[str, Callable[[Place], Iterator[Record]]] = {

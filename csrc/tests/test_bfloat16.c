@@ -108,8 +108,8 @@ static void test_exact_factors(const ast_kernels *low, const ast_kernels *full) 
 
 /* ---- factors that are rounded ---- */
 
-/* Two scenes, the second one with a third of the queries and keys: errors of half a per cent, as weights and values have
- * 8 binary digits; dropped weights are the same. */
+/* Two scenes, the second one with a third of the queries and keys. Weights and values have 8 binary digits, so errors
+ * of half a per cent are expected; dropped weights are the same. */
 static void check_attention(const ast_kernels *low, const ast_kernels *full, int64_t queries, int64_t keys, int64_t D,
                             float dropout) {
   const int64_t H = 2, q_offsets[] = {0, queries, queries + queries / 3}, k_offsets[] = {0, keys, keys + keys / 3},

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ast_sim.inference.effort import DIALS
 from benchmarks.studies import jumps
 
 
@@ -32,7 +33,7 @@ def test_a_row_is_trained_measured_and_shown_and_found_again(small):
     found = json.loads(jumps.RESULTS.read_text())
     row, walk = found["small"], found["walk"]
     assert len(row["scenes"]) == 2 and row["solver"]["scenes"] == 1 and walk["solver"] is None
-    assert len(row["by_calls"]) == 1 + sum(row["effort"].values())
+    assert len(row["by_calls"]) == 1 + sum(row["effort"][dial] for dial in DIALS)
     dial = {(turned["corrections"], turned["newton_steps"]): turned for turned in row["dial"]}
     assert set(dial) == {(0, 0), (1, 0), (2, 0), (3, 0), *((c, n) for c in (0, 1) for n in (1, 2, 10))}
     assert np.mean(dial[1, 2]["relative_error"]) != np.mean(dial[1, 0]["relative_error"])
@@ -40,7 +41,7 @@ def test_a_row_is_trained_measured_and_shown_and_found_again(small):
     default = dial[row["effort"]["corrections"], row["effort"]["newton_steps"]]
     assert row["relative_error"] == pytest.approx(np.mean(default["relative_error"]), rel=1e-6)
     assert (
-        walk["effort"] == {"corrections": 0, "newton_steps": 0, "solved": False}
+        walk["effort"] == {"corrections": 0, "newton_steps": 0, "solved": False, "precision": "float32"}
         and walk["by_calls"] == walk["dial"] == []
     )
     text = jumps.PAGE.read_text()
