@@ -129,6 +129,7 @@ def test_files_that_have_no_name(run, scene, data, answer, tmp_path):
         ],
         "spec": [lambda x: run.predict(spec=x), run.sweep, lambda x: ast_sim.worth(x, tmp_path / "w", 5)],
         "out": [lambda x: ast_sim.train(data, x), lambda x: ast_sim.generate("deforming_plate", x, train=1)],
+        "parts": [lambda x: ast_sim.generate("abcd", tmp_path / "p.h5", train=1, parts=x)],
         "data": [lambda x: ast_sim.train(x, tmp_path / "r")],
         "source": [lambda x: ast_sim.convert(x, tmp_path / "c.h5")],
         "from_run": [lambda x: ast_sim.train(data, tmp_path / "r", from_run=x)],

@@ -57,10 +57,13 @@ def checked_recipe(
             having = ", ".join(key for key, known in FAMILIES.items() if name in known.options)
             raise ConfigError(f"{family} has no option {name}; these families have it: {having}")
     nodes = module.DEFAULT_NODES if nodes is None else nodes
+    yielding: tuple[str, ...] = ()
     if "spec" in FAMILIES[family].options:
         if spec is None:
             raise ConfigError(f"{family} needs a specification: spec=FILE (ast-sim generate {family} FILE --out DATA)")
-        frames = read_spec(spec).frames if frames is None else frames
+        read = read_spec(spec)
+        frames = read.frames if frames is None else frames
+        yielding = read.yielding
     if "frames" in FAMILIES[family].options:
         frames = module.FRAMES if frames is None else frames
         if frames < module.MINIMUM_FRAMES:
@@ -73,7 +76,6 @@ def checked_recipe(
         raise ConfigError(f"seed is {seed}; must be from 0 to 2^63 - 1, the largest number that the file can hold")
     if nodes is not None and nodes < fewest:
         raise ConfigError(f"nodes is {nodes}; must be at least {fewest}")
-    yielding = () if spec is None else read_spec(spec).yielding
     solver = solver or ("calculix" if yielding else "own")
     if solver == "own" and yielding:
         raise ConfigError(
@@ -85,11 +87,11 @@ def checked_recipe(
     if patient and solver != "own":
         raise ConfigError(f"patient is for the own solver; {solver} has limits of its own")
     if parts is not None:
-        _source(parts)
+        _source(parts := file_name(parts, "parts"))
     if keep is not None:
         keep = _checked_keep(keep, (frames or module.FRAMES) - 1)
-    parts = None if parts is None else str(file_name(parts, "parts").resolve())
-    spec = None if spec is None else str(file_name(spec, "spec").resolve())
+    parts = None if parts is None else str(Path(parts).resolve())
+    spec = None if spec is None else str(Path(spec).resolve())
     return Recipe(family, seed, nodes, frames, solver, parts, spec, patient, keep, order)
 
 
