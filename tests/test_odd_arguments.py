@@ -187,6 +187,14 @@ def test_files_that_have_no_name(run, scene, data, answer, tmp_path):
         (lambda: ast_sim.plate((1, 1, 0.1), (4, 4, 1), [(0, 0, -0.1)]), "holes of the plate must be triples"),
         (lambda: ast_sim.plate((1, 1, 0.1), (4, 4, 1), [(0, 0)]), "holes of the plate must be triples"),
         (lambda: ast_sim.plate((1, 1, 0.1), (4, 4, 1), [(0, 0, math.nan)]), "holes of the plate must be triples"),
+        (lambda: ast_sim.FieldNames(displacement=""), "FieldNames: displacement is ''; it must be a name"),
+        (lambda: ast_sim.FieldNames(obstacle=5), "FieldNames: obstacle is 5; it must be a name"),
+        (lambda: ast_sim.FieldNames(fields=[5]), "FieldNames: fields is [5]; it must be a name"),
+        (lambda: ast_sim.FieldNames(material="young"), "material is 'young'; it must be a list of names"),
+        (lambda: ast_sim.FieldNames(newton=math.nan), "FieldNames: newton is nan"),
+        (lambda: ast_sim.FieldNames(newton="1"), "FieldNames: newton is '1'; it must be a number"),
+        (lambda: Motion(None).check(Scene.of(POINTS, CELLS)), "position of a motion is None; it must be an array"),
+        (lambda: ast_sim.TensorBoard(__file__), "cannot be made (File exists)"),
         (lambda: ast_sim.example_run(5), "there is no example run 5"),
     ],
 )
@@ -243,6 +251,11 @@ def test_a_dataset_of_what_it_cannot_hold(tmp_path):
     ):
         refused(lambda changes=changes: write(facts=replace(info, **changes)), text)
     refused(lambda: write(facts=None), "info is None; it must be a DatasetInfo")
+    writer = ast_sim.DatasetWriter(tmp_path / "w.h5", info)
+    with writer:
+        writer.add("train", truth)
+    refused(lambda: writer.add("train", truth), "add in the block of `with DatasetWriter(...)`")
+    (tmp_path / "w.h5").unlink()
     assert not list(tmp_path.iterdir())
 
 
@@ -285,9 +298,15 @@ def test_errors_beside_a_truth_of_another_motion_are_not_written(answer, tmp_pat
     assert not (tmp_path / "b.vtkhdf").exists()
 
 
-def test_arguments_of_long_work(data, run, tmp_path):
+def test_arguments_of_long_work(data, run, answer, tmp_path, tmp_path_factory):
+    series = tmp_path_factory.mktemp("series") / "a.pvd"
+    answer.save(series)
+
     def train(**settings):
         return lambda: ast_sim.train(data, tmp_path / "run", steps=1, progress=False, **settings)
+
+    def convert(**options):
+        return lambda: ast_sim.convert(series, tmp_path / "c.h5", progress=False, **options)
 
     def generate(**settings):
         return lambda: ast_sim.generate("deforming_plate", tmp_path / "g.h5", progress=False, **settings)
@@ -306,6 +325,13 @@ def test_arguments_of_long_work(data, run, tmp_path):
         (train(model_settings=5), "model_settings is 5; it must be values by name"),
         (train(model=5), "there is no model 5"),
         (train(preset=5), "there is no preset of ast 5"),
+        (convert(names=5), "names is 5; it must be ast_sim.FieldNames(...)"),
+        (convert(splits=5), "splits is 5; it must be shares or names of simulations by split"),
+        (convert(splits={"train": math.nan}), "must be at least 0 and add up to 1"),
+        (convert(splits={"train": "one"}), "train is 'one'; it must be a list of names"),
+        (lambda: ast_sim.plan(data, tmp_path / "p", None), "minutes is None; it must be a number"),
+        (lambda: ast_sim.worth("a.toml", tmp_path / "p", None), "minutes is None; it must be a number"),
+        (lambda: run.sweep("a.toml", [1]), "parameters is of the type list; it must be values by name"),
         (generate(patient="no"), "patient is 'no'; it must be True or False"),
         (generate(seed=None), "seed is None; must be from 0 to"),
         (generate(workers=1.5), "workers is 1.5; it must be a whole number"),
