@@ -39,10 +39,10 @@ def checked_recipe(
     nodes: int | None,
     frames: int | None,
     solver: str | None,
-    parts: str | Path | None,
+    parts: str | os.PathLike[str] | None,
     patient: bool = False,
     keep: Sequence[int] | None = None,
-    spec: str | Path | None = None,
+    spec: str | os.PathLike[str] | None = None,
     order: int | None = None,
 ) -> Recipe:
     """The recipe with these settings, after a check. A setting that is None takes the family's default.
@@ -120,12 +120,13 @@ def recipe_of(name: str, info: DatasetInfo, made_from: str | os.PathLike[str] | 
         raise ConfigError(f"{name} was made of {own[key]}: say where to find that: made_from=PATH (--made-from PATH)")
     parts, spec = (None if made_from is None or key != which else file_name(made_from, "made_from") for which in own)
     try:
-        numbers = whole(seed=made["seed"], nodes=made.get("nodes"), frames=made.get("frames"))
+        seed, nodes, frames = whole(seed=made["seed"], nodes=made.get("nodes"), frames=made.get("frames"))
     except (KeyError, ConfigError) as error:
         raise ConfigError(f"{name}: its settings cannot be read ({error!r})") from error
     try:
         keep, order = made.get("keep"), made.get("order")
-        recipe = checked_recipe(family_module(family), family, *numbers, None, parts, False, keep, spec, order)
+        module = family_module(family)
+        recipe = checked_recipe(module, family, seed, nodes, frames, None, parts, False, keep, spec, order)
     except TypeError as error:
         raise ConfigError(f"{name}: its settings cannot be read ({error!r})") from error
     if parts is not None and _source(parts).describe().get("parts") != made["parts"]:
@@ -191,12 +192,13 @@ def check_parts(recipe: Recipe) -> None:
     if recipe.spec is not None:
         from ast_sim.simulate.families import assembly
 
+        assert recipe.frames is not None  # the specification has them
         assembly.check_spec(read_spec(recipe.spec), recipe.nodes, recipe.frames, recipe.keep)
     if recipe.parts is not None:
         _source(recipe.parts).check()
 
 
-def _source(parts: str | Path | None) -> PartSource:
+def _source(parts: str | os.PathLike[str] | None) -> PartSource:
     from ast_sim.simulate.shapes.part_source import part_source
 
     return part_source(None if parts is None else Path(parts))
