@@ -57,7 +57,7 @@ def demo(out: Path, quick: bool = False, seed: int = 0) -> Figures:
     started = time.perf_counter()
     size = QUICK if quick else FULL
     data, unseen, run_folder = out / "data.h5", out / "unseen.h5", out / "run"
-    plates = {"seed": seed, "nodes": NODES, "frames": FRAMES}
+    plates: dict[str, Any] = {"seed": seed, "nodes": NODES, "frames": FRAMES}
 
     _announce(0, "a new plate, answered by the run that comes with the package")
     _show_first(out, plates)

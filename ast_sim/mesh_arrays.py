@@ -69,10 +69,12 @@ def scene_arrays(
 def _nodes(name: str, handles: Any, count: int) -> np.ndarray:
     """The numbers of the nodes, from numbers or from a mask [N]."""
     nodes = np.asarray(handles)
+    if not nodes.ndim:
+        raise ConfigError(f"handles is {in_short(handles)}; it must be a list of nodes, or True or False for each")
     if nodes.dtype == bool:
         require_array(name, "handles", nodes, np.bool_, (count,))
         return np.flatnonzero(nodes)
-    nodes = whole_numbers(name, "handles", handles, np.int64).reshape(-1)
+    nodes = whole_numbers(name, "handles", nodes, np.int64).reshape(-1)
     require_nodes(name, "handle", nodes[:, None], count)
     return nodes
 

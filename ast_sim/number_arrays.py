@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from decimal import Decimal
 from typing import Any
 
@@ -148,6 +148,20 @@ def ascending(name: str, numbers: Any) -> list[int]:
     if not chosen:
         raise ConfigError(f"{name} is empty: name at least one")
     return sorted(chosen)
+
+
+def require_numbering(name: str, count: int, frames: Sequence[int] | None, times: Sequence[float] | None) -> None:
+    """Raise DatasetError unless the numbers and the times of frames, where they are known, are `count` and ascend."""
+    for what, values, kinds, kind in (("frames", frames, "iu", "whole numbers"), ("times", times, "iuf", "finite")):
+        if values is None:
+            continue
+        if len(values) != count:
+            raise DatasetError(f"{name}: {what} has {len(values)} numbers for {count} frames")
+        are_numbers = np.asarray(values).dtype.kind in kinds
+        if not are_numbers or not np.isfinite(values).all() or (np.diff(values) <= 0).any():
+            raise DatasetError(f"{name}: {what} must be {kind} and ascend: {list(values)}")
+    if frames is not None and frames[0] < 0:
+        raise DatasetError(f"{name}: frames starts at {frames[0]}; the first frame of a motion is 0")
 
 
 def ranges(numbers: Iterable[int]) -> str:

@@ -214,6 +214,7 @@ class Motion:
 
     def check(self, scene: Scene) -> None:
         """Raise ConfigError unless the shape fits `scene`, there are two or more frames, and all numbers are finite."""
+        require_type("position of a motion", self.position, np.ndarray, "an array; Motion.of_positions takes lists")
         n = scene.num_nodes
         p = int(scene.prescribed.sum())
         shape = self.position.shape

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -12,9 +12,9 @@ import numpy as np
 from ast_sim.element_topology import LOCAL_EDGES, surface_triangles, unique_edges
 from ast_sim.mesh_arrays import NodeType, arrays_of_mesh, joined_arrays, mesh_of_arrays, require_mesh, scene_arrays
 from ast_sim.named_field import NamedField
-from ast_sim.number_arrays import ascending, ranges, require_array, require_finite, require_nodes
+from ast_sim.number_arrays import ascending, ranges, require_array, require_finite, require_nodes, require_numbering
 from ast_sim.scene_summary import scene_drawing, scene_facts
-from ast_sim.support.argument_checks import require_type
+from ast_sim.support.argument_checks import require_type, several
 from ast_sim.support.errors import DatasetError
 from ast_sim.support.notebook_table import html_table, one_line
 
@@ -239,6 +239,11 @@ class Trajectory:
     length_unit: str | None = None
     fields: dict[str, NamedField] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        for name in ("frames", "times"):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, tuple(several(name, getattr(self, name), "numbers")))
+
     def _facts(self) -> dict[str, str]:
         return {
             "frames": ranges(self.numbers),
@@ -305,13 +310,15 @@ class Trajectory:
         Raises:
             DatasetError: something is wrong; the text names `name`, and the frame and the node if there is one.
         """
+        require_type(f"{name}: its scene", self.scene, Scene, "a Scene")
+        require_type(f"{name}: its fields", self.fields, Mapping, "fields by name")
         self.scene.check(name)
         n, e = self.scene.num_nodes, self.scene.num_elements
         require_array(name, "position", self.position, np.float32, (None, n, 3))
         if self.num_frames == 0:
             raise DatasetError(f"{name}: a trajectory needs at least one frame")
         require_finite(name, "position", "node", self.position)
-        self._check_numbering(name)
+        require_numbering(name, self.num_frames, self.frames, self.times)
         for key, one in self.fields.items():
             require_type(f"{name}: the field {key}", one, NamedField, "a NamedField")
             one.check(name, key, self.num_frames, n, e)
@@ -324,6 +331,8 @@ class Trajectory:
         if self.stress is None:
             return
         location = stress_location or self.stress_location
+        if location not in (None, "node", "element"):
+            raise DatasetError(f"{name}: stress_location is {location!r}; it must be 'node' or 'element'")
         if self.stress_location not in (None, location):
             raise DatasetError(
                 f"{name}: has stress at each {self.stress_location}, but stress_location is {location!r}"
@@ -333,16 +342,3 @@ class Trajectory:
         if self.stress.shape[1] not in rows:
             raise DatasetError(f"{name}: stress has {self.stress.shape[1]} rows; needs {' or '.join(map(str, rows))}")
         require_finite(name, "stress", location or "row", self.stress)
-
-    def _check_numbering(self, name: str) -> None:
-        """Raise DatasetError unless `frames` and `times` have a number for each frame and ascend."""
-        for what, values in (("frames", self.frames), ("times", self.times)):
-            if values is None:
-                continue
-            if len(values) != self.num_frames:
-                raise DatasetError(f"{name}: {what} has {len(values)} numbers for {self.num_frames} frames")
-            are_numbers = np.asarray(values).dtype.kind in "iuf"
-            if not are_numbers or not np.isfinite(values).all() or (np.diff(values) <= 0).any():
-                raise DatasetError(f"{name}: {what} must be finite and ascend: {list(values)}")
-        if self.frames is not None and self.frames[0] < 0:
-            raise DatasetError(f"{name}: frames starts at {self.frames[0]}; the first frame of a motion is 0")

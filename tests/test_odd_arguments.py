@@ -17,6 +17,7 @@ import ast_sim
 from ast_sim import Effort, Material, Motion, Scene
 from ast_sim.support.argument_checks import file_name, in_short, require_bool, several
 from ast_sim.support.errors import AstSimError, ConfigError, DatasetError
+from ast_sim.view import page
 
 PRESS = {1: (0, 0, -0.01)}
 POINTS, CELLS = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 1, 2, 3]]
@@ -91,6 +92,9 @@ def test_what_is_no_motion(run, scene, motion, text):
         ({"stress": "a"}, "stress must be numbers"),
         ({"stress": [[1, 2], [3]]}, "stress must be an array"),
         ({"throw": "no"}, "throw is 'no'; it must be True or False"),
+        ({"name": 5}, "name is 5; it must be a text"),
+        ({"frames": {1: 2}}, "frames must be whole numbers, one such number, or a slice, not {1: 2}"),
+        ({"progress": lambda: None}, "it must be True, False or a function of (done, total, text)"),
     ],
 )
 def test_arguments_of_a_prediction(run, scene, changes, text):
@@ -105,15 +109,19 @@ def test_a_stress_that_is_not_finite_is_refused(run, scene):
 
 def test_arguments_of_several_predictions(run, scene):
     pairs = "it must be a list of pairs of a scene and a motion"
-    for scenes in (None, 5, "ab"):
+    for scenes in (None, 5, "ab", np.array(5), {"a": (scene, PRESS)}):
         refused(lambda scenes=scenes: run.predict_scenes(scenes), f"scenes is {in_short(scenes)}; {pairs}")
-    for scenes in ([scene], [(scene,)], {"a": (scene, PRESS)}):
-        refused(lambda scenes=scenes: run.predict_scenes(scenes), pairs)
+    for scenes in ([scene], [(scene,)]):
+        refused(lambda scenes=scenes: run.predict_scenes(scenes), "it must be a pair of a scene and a motion")
     refused(lambda: run.predict_scenes([(scene, PRESS)], names=["a", "b"]), "there are 2 names for 1 scenes")
     refused(lambda: run.predict_scenes([(scene, PRESS)], names="a"), "names is 'a'; it must be a list")
-    refused(lambda: run.predict_motions(scene, None), "motions is None; it must be a list of motions")
+    for motions in (None, PRESS):
+        text = f"motions is {in_short(motions)}; it must be a list of motions"
+        refused(lambda motions=motions: run.predict_motions(scene, motions, num_frames=3), text)
     (answer,) = run.predict_scenes([(scene, PRESS)], names=(n for n in ["a"]), frames=-1, effort=Effort())
     assert answer.name == "a"
+    both = run.predict_motions(scene, [PRESS] * 2, num_frames=3, frames=(n for n in [2]), effort=Effort())
+    assert [answer.frames for answer in both] == [(2,), (2,)]
 
 
 def test_files_that_have_no_name(run, scene, data, answer, tmp_path):
@@ -122,14 +130,14 @@ def test_files_that_have_no_name(run, scene, data, answer, tmp_path):
             ast_sim.Run,
             ast_sim.Dataset,
             run.save,
-            run.open,
             answer.save,
             answer.save_forces,
             ast_sim.new_model,
         ],
         "spec": [lambda x: run.predict(spec=x), run.sweep, lambda x: ast_sim.worth(x, tmp_path / "w", 5)],
         "out": [lambda x: ast_sim.train(data, x), lambda x: ast_sim.generate("deforming_plate", x, train=1)],
-        "data": [lambda x: ast_sim.train(x, tmp_path / "r")],
+        "parts": [lambda x: ast_sim.generate("abcd", tmp_path / "p.h5", train=1, parts=x)],
+        "data": [run.open, run.evaluate, lambda x: ast_sim.train(x, tmp_path / "r")],
         "source": [lambda x: ast_sim.convert(x, tmp_path / "c.h5")],
         "from_run": [lambda x: ast_sim.train(data, tmp_path / "r", from_run=x)],
         "config": [lambda x: ast_sim.train(data, tmp_path / "r", config=x)],
@@ -162,6 +170,7 @@ def test_files_that_have_no_name(run, scene, data, answer, tmp_path):
         (lambda: Scene.of(POINTS, CELLS, obstacles=[0.0]), "body is 0.0; it must be a whole number"),
         (lambda: Scene.of(POINTS, CELLS, obstacles="0"), "obstacles is '0'; it must be a list"),
         (lambda: Scene.of(np.ma.masked_equal(POINTS, 1), CELLS), "points has masked numbers"),
+        (lambda: Scene.of(POINTS, CELLS, handles=2), "handles is 2; it must be a list of nodes"),
         (lambda: Scene.join(Scene.of(POINTS, CELLS), 5), "a scene to join is 5; it must be a Scene"),
         (lambda: Scene.from_meshio(5), "the mesh is 5; it must be a mesh of meshio"),
         (lambda: Motion.of_bodies(None, PRESS, 3), "scene is None; it must be a Scene"),
@@ -178,6 +187,14 @@ def test_files_that_have_no_name(run, scene, data, answer, tmp_path):
         (lambda: ast_sim.plate((1, 1, 0.1), (4, 4, 1), [(0, 0, -0.1)]), "holes of the plate must be triples"),
         (lambda: ast_sim.plate((1, 1, 0.1), (4, 4, 1), [(0, 0)]), "holes of the plate must be triples"),
         (lambda: ast_sim.plate((1, 1, 0.1), (4, 4, 1), [(0, 0, math.nan)]), "holes of the plate must be triples"),
+        (lambda: ast_sim.FieldNames(displacement=""), "FieldNames: displacement is ''; it must be a name"),
+        (lambda: ast_sim.FieldNames(obstacle=5), "FieldNames: obstacle is 5; it must be a name"),
+        (lambda: ast_sim.FieldNames(fields=[5]), "FieldNames: fields is [5]; it must be a name"),
+        (lambda: ast_sim.FieldNames(material="young"), "material is 'young'; it must be a list of names"),
+        (lambda: ast_sim.FieldNames(newton=math.nan), "FieldNames: newton is nan"),
+        (lambda: ast_sim.FieldNames(newton="1"), "FieldNames: newton is '1'; it must be a number"),
+        (lambda: Motion(None).check(Scene.of(POINTS, CELLS)), "position of a motion is None; it must be an array"),
+        (lambda: ast_sim.TensorBoard(__file__), "cannot be made (File exists)"),
         (lambda: ast_sim.example_run(5), "there is no example run 5"),
     ],
 )
@@ -216,6 +233,9 @@ def test_a_dataset_of_what_it_cannot_hold(tmp_path):
     for trajectory, text in (
         (truth.scene, "trajectory is of the type Scene; it must be a Trajectory"),
         (None, "trajectory is None; it must be a Trajectory"),
+        (replace(truth, scene=5), "its scene is 5; it must be a Scene"),
+        (replace(truth, fields=None), "its fields is None; it must be fields by name"),
+        (replace(truth, frames=map(float, range(7))), "frames must be whole numbers and ascend"),
         (replace(truth, position=truth.position.tolist()), "position must be an array of float32"),
         (replace(truth, times=(0, 1, 2, 3, 4, 5, "a")), "times must be finite and ascend"),
         (replace(truth, fields={"PEEQ": truth.stress}), "the field PEEQ is of the type ndarray"),
@@ -234,6 +254,11 @@ def test_a_dataset_of_what_it_cannot_hold(tmp_path):
     ):
         refused(lambda changes=changes: write(facts=replace(info, **changes)), text)
     refused(lambda: write(facts=None), "info is None; it must be a DatasetInfo")
+    writer = ast_sim.DatasetWriter(tmp_path / "w.h5", info)
+    with writer:
+        writer.add("train", truth)
+    refused(lambda: writer.add("train", truth), "add in the block of `with DatasetWriter(...)`")
+    (tmp_path / "w.h5").unlink()
     assert not list(tmp_path.iterdir())
 
 
@@ -243,6 +268,17 @@ def test_frames_and_scenes_by_number(data):
         with pytest.raises(IndexError, match="^test has 2 scenes: there is no 5$"):
             dataset["test"][5]
     assert truth.select(number for number in (2, 0)).numbers == (0, 2)
+    for frames in (list(range(7)), np.arange(7), iter(range(7))):
+        assert replace(truth, frames=frames).numbers == tuple(range(7))
+    refused(replace(truth, stress_location="nodes").check, "stress_location is 'nodes'; it must be 'node' or 'element'")
+    with ast_sim.Dataset(data) as dataset:
+        for index in ("0", 0.5, None):
+            text = f"index is {index!r}; it must be a whole number"
+            refused(lambda index=index: dataset.load("test", index), text)
+        refused(lambda: dataset.load("test", 0, "PEEQ"), "fields is 'PEEQ'; it must be a list of names")
+        with pytest.raises(TypeError, match="'slice' object cannot be interpreted as an integer"):
+            dataset.torch("test")[0:2]
+    refused(lambda: ast_sim.FramePairs(data, "test"), "it must be an open ast_sim.Dataset")
     refused(lambda: truth.select(1), "frames is 1; it must be a list of whole numbers")
     refused(lambda: truth.select([1.0]), "frames is 1.0; it must be a whole number")
     refused(lambda: truth.select([]), "frames is empty: name at least one")
@@ -265,9 +301,15 @@ def test_errors_beside_a_truth_of_another_motion_are_not_written(answer, tmp_pat
     assert not (tmp_path / "b.vtkhdf").exists()
 
 
-def test_arguments_of_long_work(data, run, tmp_path):
+def test_arguments_of_long_work(data, run, answer, tmp_path, tmp_path_factory):
+    series = tmp_path_factory.mktemp("series") / "a.pvd"
+    answer.save(series)
+
     def train(**settings):
         return lambda: ast_sim.train(data, tmp_path / "run", steps=1, progress=False, **settings)
+
+    def convert(**options):
+        return lambda: ast_sim.convert(series, tmp_path / "c.h5", progress=False, **options)
 
     def generate(**settings):
         return lambda: ast_sim.generate("deforming_plate", tmp_path / "g.h5", progress=False, **settings)
@@ -275,11 +317,24 @@ def test_arguments_of_long_work(data, run, tmp_path):
     for call, text in (
         (train(resume="no"), "resume is 'no'; it must be True or False"),
         (train(callback=5), "callback is 5; it must be a function of (step, figures)"),
+        (train(callback=ast_sim.TensorBoard), "callback is the class TensorBoard; it must be a function of"),
+        (train(state=["PEEQ"], model_settings={"state": ["U"]}), "model_settings has the state, too: give it once"),
+        (train(preset=""), "there is no preset of ast ''"),
+        (train(model=""), "there is no model ''"),
+        (lambda: ast_sim.train(data, data, steps=1, progress=False), "cannot be made (File exists)"),
+        (lambda: ast_sim.train(tmp_path, tmp_path / "r", steps=1, progress=False), "is a folder: name the file"),
         (train(state=5), "state is 5; it must be a list of names"),
         (train(state="PEEQ"), "state is 'PEEQ'; it must be a list of names"),
         (train(model_settings=5), "model_settings is 5; it must be values by name"),
         (train(model=5), "there is no model 5"),
         (train(preset=5), "there is no preset of ast 5"),
+        (convert(names=5), "names is 5; it must be ast_sim.FieldNames(...)"),
+        (convert(splits=5), "splits is 5; it must be shares or names of simulations by split"),
+        (convert(splits={"train": math.nan}), "must be at least 0 and add up to 1"),
+        (convert(splits={"train": "one"}), "train is 'one'; it must be a list of names"),
+        (lambda: ast_sim.plan(data, tmp_path / "p", None), "minutes is None; it must be a number"),
+        (lambda: ast_sim.worth("a.toml", tmp_path / "p", None), "minutes is None; it must be a number"),
+        (lambda: run.sweep("a.toml", [1]), "parameters is of the type list; it must be values by name"),
         (generate(patient="no"), "patient is 'no'; it must be True or False"),
         (generate(seed=None), "seed is None; must be from 0 to"),
         (generate(workers=1.5), "workers is 1.5; it must be a whole number"),
@@ -291,6 +346,10 @@ def test_arguments_of_long_work(data, run, tmp_path):
             lambda: run.evaluate(data, solver_scenes=0, made_from="spec.toml"),
             "made_from is for the solver: give solver_scenes",
         ),
+        (lambda: page.write(tmp_path / "a.html", {}, 5), "title is 5; it must be a text"),
+        (lambda: run.evaluate(data, command=5), "command is 5; it must be a text"),
+        (lambda: ast_sim.trade(run, command=5), "command is 5; it must be a text"),
+        (lambda: ast_sim.trade(run, solver_seconds=1, made_from="spec.toml"), "made_from is for our solver"),
         (lambda: run.expected_error(None), "effort is None; it must be an Effort"),
     ):
         refused(call, text)

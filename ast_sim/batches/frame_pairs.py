@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Sequence
 
 import numpy as np
@@ -12,6 +13,7 @@ from torch.utils.data import Dataset as TorchDataset
 from ast_sim.dataset.layout import GIVEN_FRAMES
 from ast_sim.dataset.reader import Dataset
 from ast_sim.ops import join_indices
+from ast_sim.support.argument_checks import require_type
 from ast_sim.support.errors import DatasetError
 
 
@@ -45,6 +47,7 @@ class FramePairs(TorchDataset[dict[str, Tensor]]):
     """
 
     def __init__(self, dataset: Dataset, split: str) -> None:
+        require_type("dataset", dataset, Dataset, "an open ast_sim.Dataset")
         self._dataset = dataset
         self._split = split
         self._given = GIVEN_FRAMES[dataset.info.integration]
@@ -56,7 +59,7 @@ class FramePairs(TorchDataset[dict[str, Tensor]]):
         return int(self._starts[-1])
 
     def __getitem__(self, number: int) -> dict[str, Tensor]:
-        number = range(len(self))[number]  # an IndexError where there is none ends a loop over all
+        number = range(len(self))[operator.index(number)]  # an IndexError where there is none ends a loop over all
         index = int(np.searchsorted(self._starts, number, side="right")) - 1
         frame = self._given + number - int(self._starts[index])
         scene = self._dataset.scene(self._split, index)

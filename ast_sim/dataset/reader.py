@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Collection, Iterator
-from itertools import chain
+from numbers import Integral
 from typing import TYPE_CHECKING, Self
 
 import h5py
@@ -33,9 +33,9 @@ from ast_sim.dataset.layout import (
 from ast_sim.dataset.split import Split
 from ast_sim.material import Material
 from ast_sim.named_field import NamedField
-from ast_sim.number_arrays import require_finite
+from ast_sim.number_arrays import require_finite, require_numbering
 from ast_sim.scene import AttributeValue, Scene, Trajectory
-from ast_sim.support.argument_checks import file_name
+from ast_sim.support.argument_checks import file_name, require_type, several
 from ast_sim.support.byte_cache import ByteCache, cache_bytes
 from ast_sim.support.errors import DatasetError
 from ast_sim.support.notebook_table import html_table, one_line
@@ -188,8 +188,8 @@ class Dataset:
         return position[start:stop], None if stress is None else stress[start:stop]
 
     def load(self, split: str, index: int, fields: Collection[str] = ()) -> Trajectory:
-        """A trajectory without its `cauchy_stress`, and with these `fields`, if it has them: all are
-        large; `dataset[split][index]` has all."""
+        """A trajectory without its `cauchy_stress`, and with these `fields`, if it has them: all are large;
+        `dataset[split][index]` has all."""
         position, stress = self.frames(split, index, 0, self.num_frames(split, index))
         frames, times = self._numbering(split, index)
         trajectory = Trajectory(
@@ -203,7 +203,7 @@ class Dataset:
             length_unit=self.info.length_unit,
             fields=self.fields(split, index, fields) if fields else {},
         )
-        trajectory._check_numbering(self._name(split, index))
+        require_numbering(self._name(split, index), trajectory.num_frames, frames, times)
         return trajectory
 
     def _numbering(self, split: str, index: int) -> tuple[tuple[int, ...] | None, tuple[float, ...] | None]:
@@ -247,13 +247,14 @@ class Dataset:
 
     def fields(self, split: str, index: int, names: Collection[str] | None = None) -> dict[str, NamedField]:
         """The named fields of a trajectory, in all frames; with `names`, only these, where it has them."""
+        wanted = None if names is None else set(several("fields", names, "names"))
         group, count = self._group(split, index), self.num_frames(split, index)
         if not self._file.has(group, FIELDS):
             return {}
         scene, name = self.scene(split, index), self._name(split, index)
         stored = self._file.child(group, FIELDS, h5py.Group)
         fields: dict[str, NamedField] = {}
-        for key in sorted(stored if names is None else set(stored).intersection(names)):
+        for key in sorted(stored if wanted is None else wanted.intersection(stored)):
             array = self._file.array(stored, key, kind=FIELD_KIND)
             facts = self._file.attributes(array)
             fields[key] = NamedField(self._file.read(array), str(facts.get("location")), str(facts.get("unit", "")))
@@ -293,6 +294,7 @@ class Dataset:
 
     def _unverified(self, split: str, index: int) -> h5py.Group:
         """The group of a trajectory before its hash was compared."""
+        require_type("index", index, Integral, "a whole number")
         count = self.count(split)
         if not 0 <= index < count:
             raise DatasetError(f"{self.path}: there is no sample {index} in {split}, which has {count}")
@@ -343,7 +345,7 @@ class Dataset:
 
     def _keeps(self, split: str) -> bool:
         if split not in self._kept:
-            arrays = [self._framed(split, index).values() for index in range(self.splits[split])]
-            size = sum(array.nbytes for array in chain.from_iterable(arrays))
+            samples = (self._framed(split, index) for index in range(self.splits[split]))
+            size = sum(array.nbytes for arrays in samples for array in arrays.values())
             self._kept[split] = size <= min(cache_bytes(), self._file.size)
         return self._kept[split]

@@ -52,6 +52,7 @@ class DatasetWriter:
         require_type("info", info, DatasetInfo, "a DatasetInfo")
         info.check(str(path))
         self.info = info
+        self._is_open = False
         self.counts = dict.fromkeys(SPLITS, 0)
         self._kind: tuple[int, int] | None = None  # (nodes per element, material width) of all trajectories
         self._fields: dict[str, tuple[str, str, int]] | None = None  # the named fields of all trajectories
@@ -67,6 +68,10 @@ class DatasetWriter:
 
     def add(self, split: str, trajectory: Trajectory) -> None:
         """Check a trajectory and append it to the split "train", "valid", "test" or "calibration"."""
+        if not self._is_open:
+            raise DatasetError(
+                f"{self.path}: add in the block of `with DatasetWriter(...)`, at whose end it is written"
+            )
         if split not in SPLITS:
             raise DatasetError(f"{self.path}: there is no split {split!r}; use one of {', '.join(SPLITS)}")
         require_type("trajectory", trajectory, Trajectory, "a Trajectory")
@@ -133,6 +138,7 @@ class DatasetWriter:
             raise DatasetError(f"{self.path}: cannot be written: {failure}") from failure
 
     def __enter__(self) -> Self:
+        self._is_open = True
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
@@ -140,6 +146,7 @@ class DatasetWriter:
             if kind is None:
                 self._finish()
         finally:
+            self._is_open = False
             with contextlib.suppress(Exception):
                 self._file.close()
             self._disk.close()

@@ -21,7 +21,7 @@ from ast_sim.importers.series import FieldNames, read_series
 from ast_sim.plausibility.findings import Finding, refusal, told
 from ast_sim.plausibility.motion import in_trajectory
 from ast_sim.scene import Trajectory
-from ast_sim.support.argument_checks import file_name, require_bool
+from ast_sim.support.argument_checks import file_name, require_bool, require_type, several
 from ast_sim.support.errors import ConfigError, DatasetError, LooksWrong, nearest_name, warn
 from ast_sim.support.progress import Progress, ShowProgress
 
@@ -99,7 +99,8 @@ def convert_series(
     Raises:
         DatasetError: a file is wrong or lacks something; the text names it. Nothing is written then.
     """
-    names = names or FieldNames()
+    names = FieldNames() if names is None else names
+    require_type("names", names, FieldNames, "ast_sim.FieldNames(...)")
     series = find_series(source)
     decks = decks_of(source, series, deck, names)
     names = with_units(decks, names, length_unit)
@@ -226,6 +227,7 @@ def _assign(
             " (--shares 0 0 1) to test on all"
         )
     splits = SHARES if splits is None else splits
+    require_type("splits", splits, Mapping, "shares or names of simulations by split, such as {'train': 1}")
     unknown = next((split for split in splits if split not in SPLITS), None)
     if unknown is not None:
         raise DatasetError(f"there is no split {unknown!r}; use {', '.join(SPLITS)}")
@@ -236,7 +238,10 @@ def _assign(
     else:
         if calibration:
             raise DatasetError("splits lists names, so it lists the ones of calibration, too: leave calibration out")
-        lists = {split: [] if isinstance(members, int | float) else list(members) for split, members in given.items()}
+        lists = {
+            split: [] if isinstance(members, int | float) else several(split, members, "names")
+            for split, members in given.items()
+        }
         _require_known(source, names, lists)
     return [(split, name) for split in SPLITS for name in lists[split]]
 
@@ -252,7 +257,7 @@ def _draw(
         raise DatasetError(
             f"{source}: calibration is {calibration}; must be at least 0 and leave a simulation of {len(names)}"
         )
-    if min(shares.values()) < 0 or abs(sum(shares.values()) - 1) > 1e-6:
+    if min(shares.values()) < 0 or not abs(sum(shares.values()) - 1) <= 1e-6:  # NaN is neither
         raise DatasetError(f"the shares of the splits must be at least 0 and add up to 1, not {shares}")
     order = np.random.default_rng(seed).permutation(len(names))
     rest = len(names) - calibration

@@ -26,7 +26,9 @@ from ast_sim.importers.solved_jobs.job import Job, read_job
 from ast_sim.importers.solved_jobs.job_results import job_frames
 from ast_sim.importers.stress import STRESS_UNITS, order_of, von_mises
 from ast_sim.scene import NodeType, Scene, Trajectory
-from ast_sim.support.errors import DatasetError
+from ast_sim.support.argument_checks import several
+from ast_sim.support.errors import ConfigError, DatasetError
+from ast_sim.support.toml_settings import require_range
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,9 @@ class FieldNames:
         fields: further point or cell fields, as NAME or NAME=UNIT, that become named fields of the dataset.
         reaction: point field, the forces that act on the nodes from outside.
         newton: the unit of these forces in newton.
+
+    Raises:
+        ConfigError: a name is no text or empty, or the unit is no number above 0.
     """
 
     displacement: str | None = None
@@ -66,6 +71,14 @@ class FieldNames:
     fields: tuple[str, ...] = ()
     reaction: str | None = None
     newton: float = 1.0
+
+    def __post_init__(self) -> None:
+        lists = {name: several(name, getattr(self, name), "names") for name in ("material", "stress_order", "fields")}
+        alone = {name: [text] for name, text in vars(self).items() if text is not None and name != "newton"}
+        for name, texts in {**alone, **lists}.items():
+            if not all(isinstance(text, str) and text for text in texts):
+                raise ConfigError(f"FieldNames: {name} is {getattr(self, name)!r}; it must be a name")
+        require_range("FieldNames: newton", self.newton, 1e-30)  # above 0
 
     @property
     def material_columns(self) -> tuple[str, ...]:

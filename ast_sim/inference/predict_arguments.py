@@ -41,6 +41,7 @@ def new_question(
         ConfigError: the motion does not fit the scene, or the scene does not fit the model.
         DatasetError: an array has another dtype or shape, or holds numbers that are not finite.
     """
+    require_type("name", name, str, "a text")
     if isinstance(scene, Trajectory):
         if not (motion is None and num_frames is None and stress is None):
             raise ConfigError(
@@ -74,7 +75,7 @@ def scenes_of(scenes: Any, names: Any) -> list[tuple[Scene, Motions, str]]:
     pairs = several("scenes", scenes, "pairs of a scene and a motion")
     for pair in pairs:
         if not isinstance(pair, tuple | list) or len(pair) != 2:
-            raise ConfigError(f"scenes has {in_short(pair)}; it must be a list of pairs of a scene and a motion")
+            raise ConfigError(f"one of scenes is {in_short(pair)}; it must be a pair of a scene and a motion")
     numbered = [f"scene {number}" for number in range(len(pairs))]
     called = numbered if names is None else several("names", names, "texts, one for each scene")
     if len(called) != len(pairs):
@@ -142,11 +143,12 @@ def _completed(
         if frames < least:
             raise ConfigError(f"{name}: num_frames is {frames}; the run needs at least {least}")
         return Motion.of_bodies(scene, motion, frames)
+    if isinstance(motion, Motion):
+        motion.check(scene)
+    else:
+        motion = Motion.of_positions(scene, motion)
     if frames is not None:
         raise ConfigError(f"{name}: its motion has frames already: leave out num_frames={frames}")
-    if not isinstance(motion, Motion):
-        return Motion.of_positions(scene, motion)
-    motion.check(scene)
     return motion
 
 

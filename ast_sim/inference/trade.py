@@ -27,7 +27,7 @@ from ast_sim.inference.quantities.relative_errors import QUANTITIES, errors_of, 
 from ast_sim.inference.trained_run import Run
 from ast_sim.models.simulator import Simulator
 from ast_sim.simulate.jobs.fastest_solver import FINER, OWN_STOP_TEST, Outcome, solver_outcomes
-from ast_sim.support.argument_checks import file_name, several
+from ast_sim.support.argument_checks import file_name, require_type, several
 from ast_sim.support.disk import write_json
 from ast_sim.support.errors import ConfigError, SimulationError
 from ast_sim.support.progress import Progress, ShowProgress
@@ -120,6 +120,9 @@ def trade(
     )
     if solver_seconds is not None and not positive:
         raise ConfigError(f"the solver's seconds are {solver_seconds!r}; they must be a number above 0")
+    if solver_seconds is not None and made_from is not None:
+        raise ConfigError("made_from is for our solver, which solver_seconds stands for: give one of them")
+    require_type("command", command, str, "a text")
     require_runs(run, *several("beside", beside, "runs"))
     runs = _by_name([run, *beside])
     threads = torch.get_num_threads()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -29,7 +29,7 @@ from ast_sim.number_arrays import percent
 from ast_sim.runs import run_file
 from ast_sim.scene import Scene, Trajectory
 from ast_sim.simulate.own_assembly.grid import grid, read_table
-from ast_sim.support.argument_checks import file_name, require_bool, several
+from ast_sim.support.argument_checks import file_name, require_bool, require_type, several
 from ast_sim.support.errors import ConfigError, RolloutError, warn
 from ast_sim.support.notebook_table import html_table, one_line
 from ast_sim.support.progress import Progress, ShowProgress
@@ -226,6 +226,7 @@ class Run:
         arguments are as in `predict`."""
         began = time.perf_counter()
         config, scope = self.settings.model, self.scope
+        frames = list(frames) if isinstance(frames, Iterator) else frames  # it gives its numbers once
         questions = [
             new_question(config, scope, scene, motion, num_frames, name, frames)
             for scene, motion, name in scenes_of(scenes, names)
@@ -307,7 +308,10 @@ class Run:
         """
         if data is None and self.path.is_file():
             raise ConfigError(f"{self.path} holds no dataset: name one; the run learned from {self.settings.data}")
-        path = self.settings.data if data is None else data.path if isinstance(data, Dataset) else data
+        if isinstance(data, Dataset):
+            path = data.path
+        else:
+            path = file_name(self.settings.data if data is None else data, "data")
         dataset = Dataset(path, self.scope.length_unit)
         try:
             self.folder.require_fit(dataset)
@@ -335,6 +339,7 @@ class Run:
             progress: as in `generate`; it counts scenes, once for all frames, once for the deepest, once solved.
         """
         (solver_scenes,) = whole(0, solver_scenes=solver_scenes)
+        require_type("command", command, str, "a text")
         with self.open(data) as dataset:
             steps = 2 * dataset.count(split) + min(solver_scenes, dataset.count(split))
             with Progress(steps, "scenes", progress) as bar:

@@ -8,6 +8,7 @@ import os
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from ast_sim.planning.forecast import Forecast, forecast
 from ast_sim.planning.trials import GROWTH, LONGEST, MINUTES, Trial, Trials, candidates, round_sizes
 from ast_sim.runs.config_toml import write_settings
 from ast_sim.runs.train_config import RunConfig
-from ast_sim.support.argument_checks import file_name
+from ast_sim.support.argument_checks import file_name, require_type
 from ast_sim.support.disk import write_json
 from ast_sim.support.errors import ConfigError
 from ast_sim.support.progress import Progress, ShowProgress, duration
@@ -122,6 +123,7 @@ def planned(
     progress: ShowProgress = True,
 ) -> Plan:
     """`plan` for settings as `train` has them."""
+    require_type("minutes", minutes, Real, "a number")
     require_range("minutes", minutes, *MINUTES)
     _require_open(config)
     scenes, valid, pairs = _counted(config)

@@ -9,6 +9,7 @@ import statistics
 import time
 import warnings
 from dataclasses import dataclass
+from numbers import Real
 
 from ast_sim.dataset.reader import Dataset
 from ast_sim.dataset.solver_seconds import read_seconds
@@ -17,7 +18,7 @@ from ast_sim.inference.trained_run import Run
 from ast_sim.planning.trials import MINUTES, TIMED, Trials
 from ast_sim.simulate.jobs.generate import checked_workers, generate
 from ast_sim.simulate.own_assembly.spec_reader import read_spec
-from ast_sim.support.argument_checks import file_name
+from ast_sim.support.argument_checks import file_name, require_type
 from ast_sim.support.progress import ShowProgress, duration
 from ast_sim.support.toml_settings import require_range
 from ast_sim.training.configure import configure
@@ -95,6 +96,7 @@ def worth(
     Raises:
         AstSimError: the specification has a mistake, or scenes cannot be solved.
     """
+    require_type("minutes", minutes, Real, "a number")
     require_range("minutes", minutes, *MINUTES)
     read_spec(spec)  # a mistake in it leaves no folder
     make_folder(folder := file_name(out, "out"))

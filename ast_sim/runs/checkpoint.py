@@ -14,7 +14,7 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -153,7 +153,7 @@ def best(run_dir: str | os.PathLike[str]) -> Path | None:
     return None
 
 
-def mark_best(run_dir: str | os.PathLike[str], step: int, error: float, answers: dict[str, Any] = NOTHING) -> None:
+def mark_best(run_dir: str | os.PathLike[str], step: int, error: float, answers: Mapping[str, Any] = NOTHING) -> None:
     """Mark the checkpoint of this step as the best one; it is kept until another one is marked.
 
     Args:

@@ -84,8 +84,8 @@ def _ranges(scope: Scope) -> Iterator[tuple[str, float, float]]:
     yield f"mesh spacing [{unit}]", *scope.spacing
     yield "extent of the held nodes, as a share of the size", *scope.held
     yield f"travel of prescribed nodes [{unit}]", *scope.travel
-    for axis, *limits in zip("xyz", scope.motion_low, scope.motion_high, strict=True):
-        yield f"displacement of prescribed nodes along {axis} [{unit}]", *limits
+    for axis, low, high in zip("xyz", scope.motion_low, scope.motion_high, strict=True):
+        yield f"displacement of prescribed nodes along {axis} [{unit}]", low, high
     for name, limits in scope.material_ranges.items():
         yield f"{name} of the material", *limits
 

@@ -99,7 +99,8 @@ class Scope:
         if scene.material is None:
             return
         for name, limits in self.material_ranges.items():
-            values = self.data.material.numbers(name, scene.material)[scene.deforming_elements]
+            numbers = self.data.material.numbers(name, scene.material)
+            values = np.full(scene.num_elements, numbers)[scene.deforming_elements]
             for value in (values.min(initial=limits[0]), values.max(initial=limits[1])):
                 yield limits, float(value), f"{name} of the material is {{}}", ""
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
 import os
-from collections.abc import Iterable
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -31,11 +32,27 @@ def several(name: str, values: Any, what: str) -> list[Any]:
     """What an argument holds as a list; `what` says in words what it may hold.
 
     Raises:
-        ConfigError: it is one thing, or a text, whose letters would be taken for the things.
+        ConfigError: it is one thing; or a text, whose letters would be taken for the things; or things by name, whose
+            names would be.
     """
-    if isinstance(values, str | bytes) or not isinstance(values, Iterable):
-        raise ConfigError(f"{name} is {in_short(values)}; it must be a list of {what}")
-    return list(values)
+    wrong = ConfigError(f"{name} is {in_short(values)}; it must be a list of {what}")
+    if isinstance(values, str | bytes | Mapping):
+        raise wrong
+    try:
+        return list(values)
+    except TypeError as error:  # an array of no axis counts as Iterable
+        raise wrong from error
+
+
+def require_function(name: str, value: Any, *arguments: Any, what: str) -> None:
+    """Raise ConfigError unless the argument `name` can be called with `arguments`, which `what` says in words: a long
+    work would fail at its first call. A function in C may not tell what it takes."""
+    try:
+        inspect.signature(value).bind(*arguments)
+    except TypeError as error:
+        raise ConfigError(f"{name} is {in_short(value)}; it must be {what}") from error
+    except ValueError:
+        return
 
 
 def require_bool(**values: Any) -> None:

@@ -20,7 +20,7 @@ from typing import Self
 
 from tqdm import tqdm
 
-from ast_sim.support.errors import ConfigError
+from ast_sim.support.argument_checks import require_function
 
 ShowProgress = bool | Callable[[int, int, str], None]
 
@@ -101,8 +101,9 @@ class Progress:
     bar_format: str | None = None  # of tqdm
 
     def __init__(self, total: int, unit: str, progress: ShowProgress, done: int = 0) -> None:
-        if not (isinstance(progress, bool) or callable(progress)):
-            raise ConfigError(f"progress is {progress!r}: it must be True, False or a function of (done, total, text)")
+        if not isinstance(progress, bool):
+            known = "True, False or a function of (done, total, text)"
+            require_function("progress", progress, 0, total, "", what=known)
         self.total, self.unit, self.done = total, unit, done
         self.shown = progress is True
         self._call = None if isinstance(progress, bool) else progress

@@ -8,6 +8,7 @@ from typing import Any
 
 from ast_sim.support.argument_checks import file_name
 from ast_sim.support.errors import require
+from ast_sim.view.files import make_folder
 
 Callback = Callable[[int, dict[str, float]], None]
 
@@ -42,12 +43,14 @@ class TensorBoard:
         folder: for the event files; it is made if it is absent. A resumed training adds a file to it.
 
     Raises:
+        AstSimError: the folder cannot be made.
         MissingExtra: tensorboard is not installed.
     """
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
         _, board = require("tensorboard", "tensorboard", "torch.utils.tensorboard")
-        self._writer = board.SummaryWriter(str(file_name(folder, "folder")))
+        make_folder(path := file_name(folder, "folder"))
+        self._writer = board.SummaryWriter(str(path))
 
     def __call__(self, step: int, figures: Mapping[str, float]) -> None:
         for name, value in figures.items():

@@ -43,9 +43,9 @@ def configure(
     if from_run is None:
         with _naming(file):
             named = given.pop("model.name", "ast")
-            chosen = find_preset(model or str(named), preset or "tiny")
+            chosen = find_preset(str(named) if model is None else model, "tiny" if preset is None else preset)
         settings = RunConfig(chosen.model, TrainConfig(**chosen.train), str(data))
-    elif model or preset:
+    elif model is not None or preset is not None:
         raise ConfigError("a run that starts from another one has its model and settings: leave model and preset out")
     else:
         source = RunFolder(from_run).settings
@@ -80,11 +80,13 @@ def changes_of(
     """The changes of settings that the arguments of `train` ask for, by dotted key.
 
     Raises:
-        ConfigError: `state` is no list, or `model_settings` no mapping.
+        ConfigError: `state` is no list, or `model_settings` no mapping; or both have the state.
     """
     state = several("state", state, "names of fields, such as ['reaction']")
     model_settings = {} if model_settings is None else model_settings
     require_type("model_settings", model_settings, Mapping, "values by name, such as {'hidden': 32}")
+    if state and "state" in model_settings:
+        raise ConfigError("model_settings has the state, too: give it once")
     of_model = {**({"state": tuple(state)} if state else {}), **model_settings}
     changes = {f"model.{key}": value for key, value in of_model.items()}
     return changes | {f"train.{key}": value for key, value in train_settings.items()}

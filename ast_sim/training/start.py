@@ -23,7 +23,7 @@ from ast_sim.runs import checkpoint
 from ast_sim.runs.config_toml import has_config, write_config
 from ast_sim.runs.folder import RunFolder
 from ast_sim.runs.train_config import RunConfig
-from ast_sim.support.argument_checks import file_name, in_short, require_bool
+from ast_sim.support.argument_checks import file_name, require_bool, require_function
 from ast_sim.support.errors import RESUME, CheckpointError, ConfigError, TrainingError
 from ast_sim.support.progress import ShowProgress
 from ast_sim.support.stop_signals import StopSignals
@@ -35,6 +35,7 @@ from ast_sim.training.loop import Training, fit_statistics, sampler_of
 from ast_sim.training.parallel.launch import READY, together, usual_processes
 from ast_sim.training.parallel.processes import Processes
 from ast_sim.training.time_budget import UNKNOWN_STEPS, steps_within
+from ast_sim.view.files import make_folder
 
 
 def train(
@@ -80,8 +81,8 @@ def train(
         TrainingError, CheckpointError, KeyboardInterrupt: as in `start_training`.
     """
     require_bool(resume=resume)
-    if callback is not None and not callable(callback):
-        raise ConfigError(f"callback is {in_short(callback)}; it must be a function of (step, figures)")
+    if callback is not None:
+        require_function("callback", callback, 0, {}, what="a function of (step, figures)")
     changes = changes_of(state, model_settings, settings)
     folder = file_name(out, "out")
     source = None if from_run is None else file_name(from_run, "from_run")
@@ -223,7 +224,7 @@ def _held(run: Path, processes: Processes) -> Iterator[None]:
     """Within the block the run folder is there, and the leading process holds its lock. If it cannot, all processes
     raise. If the block fails before the run has settings, a folder that was made for it is removed."""
     absent = next((folder for folder in reversed([run, *run.parents]) if not folder.exists()), None)
-    run.mkdir(parents=True, exist_ok=True)
+    make_folder(run)
     with ExitStack() as held:
         refusal = None
         try:

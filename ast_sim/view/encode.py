@@ -16,7 +16,7 @@ import numpy as np
 from ast_sim.number_arrays import ranges
 from ast_sim.scene import Scene, Trajectory
 from ast_sim.support.errors import AstSimError
-from ast_sim.view.fields import displacement_rmse, is_planar, require_same_scene, stress_rmse, surface_owners
+from ast_sim.view.fields import displacement_rmse, is_planar, require_same_scene, root_mean_square, surface_owners
 
 Json = dict[str, Any]
 
@@ -50,9 +50,11 @@ class Boundary:
             for name, (triangles, nodes, _) in self.groups.items()
         }
 
-    def stress(self, trajectory: Trajectory) -> np.ndarray:
-        """[S, n or F]: the stress at the nodes, or on the triangles, of the deforming bodies."""
+    def stress(self, trajectory: Trajectory) -> np.ndarray | None:
+        """[S, n or F]: the stress at the nodes, or on the triangles, of the deforming bodies; None if there is none."""
         _, nodes, elements = self.groups["body"]
+        if trajectory.stress is None or not len(nodes):
+            return None
         return trajectory.stress[:, nodes if trajectory.stress_at == "node" else elements, 0]
 
     def motion(self, trajectory: Trajectory, frames: np.ndarray) -> Json:
@@ -62,8 +64,8 @@ class Boundary:
         for name, (_, nodes, _) in self.groups.items():
             moved = trajectory.position[np.ix_(frames, nodes)] - trajectory.scene.rest_position[nodes]
             encoded[name] = packed(moved) if len(nodes) else None
-        has_stress = trajectory.stress is not None and len(self.groups["body"][1])
-        encoded["stress"] = packed(self.stress(trajectory)[frames]) if has_stress else None
+        stress = self.stress(trajectory)
+        encoded["stress"] = None if stress is None else packed(stress[frames])
         return encoded
 
 
@@ -80,8 +82,9 @@ def encode_scene(truth: Trajectory, frames: np.ndarray, predictions: Sequence[Tr
     surface = Boundary(truth.scene)
     low, high = _bounds(truth)
     scales = {"displacement": _displacement_range(truth, surface)}
-    if truth.stress is not None and len(surface.groups["body"][1]):
-        scales["stress"] = _color_range(surface.stress(truth))
+    stress = surface.stress(truth)
+    if stress is not None:
+        scales["stress"] = _color_range(stress)
     return {
         "planar": is_planar(truth.scene),
         "total": truth.num_frames,
@@ -115,15 +118,18 @@ def encode_curves(truth: Trajectory, predictions: Sequence[Trajectory | None]) -
         }
     }
     if truth.stress is not None:
-        rows = truth.scene.deforming(truth.stress_at)
-        mean = truth.stress[:, rows].mean(axis=1, keepdims=True, dtype=np.float64) if rows.any() else 0.0
-        comparable = [p is not None and p.stress_at == truth.stress_at for p in predictions]
+        place = truth.stress_at
+        rows = truth.scene.deforming(place)
+        true = truth.stress[:, rows]
+        mean = true.mean(axis=1, keepdims=True, dtype=np.float64) if rows.any() else 0.0
         curves["stress"] = {
             "runs": [
-                stress_rmse(truth, p.stress[:n]).tolist() if known else None
-                for p, n, known in zip(predictions, frames, comparable, strict=True)
+                None
+                if p is None or p.stress is None or p.stress_at != place
+                else root_mean_square(p.stress[:n, rows].astype(np.float64) - true[:n]).tolist()
+                for p, n in zip(predictions, frames, strict=True)
             ],
-            "trivial": stress_rmse(truth, np.broadcast_to(mean, truth.stress.shape)).tolist(),
+            "trivial": root_mean_square(mean - true).tolist(),
         }
     return curves
 
@@ -139,7 +145,8 @@ def finite_frames(trajectory: Trajectory) -> int:
     finite = np.isfinite(trajectory.position).all(axis=(1, 2))
     if trajectory.stress is not None:
         finite &= np.isfinite(trajectory.stress).all(axis=(1, 2))
-    return len(finite) if finite.all() else int(np.argmin(finite))
+    broken = np.flatnonzero(~finite)
+    return int(broken[0]) if len(broken) else trajectory.num_frames
 
 
 def packed(values: np.ndarray) -> Json:

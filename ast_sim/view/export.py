@@ -154,16 +154,15 @@ def _write_steps(root: h5py.Group, shown: Fields) -> None:
     steps["PointOffsets"] = start * nodes
     steps["CellOffsets"] = zero[:, None]
     steps["ConnectivityIdOffsets"] = zero[:, None]
-    for group, moving in (("PointData", shown.point), ("CellData", shown.cell)):
+    for group, moving, static in (("PointData", shown.point, shown.static), ("CellData", shown.cell, {})):
         data, offsets = root.create_group(group), steps.create_group(f"{group}Offsets")
         for name, values in moving.items():
             rows = values.shape[1]
             flat = values.reshape(frames * rows, *values.shape[2:])
             data.create_dataset(name, data=flat, chunks=(rows, *flat.shape[1:]), compression="gzip")
             offsets[name] = start * rows
-    for name, values in shown.static.items():
-        root["PointData"][name] = values
-        steps["PointDataOffsets"][name] = zero
+        for name, values in static.items():
+            data[name], offsets[name] = values, zero
 
 
 def _escape(text: str) -> str:

@@ -49,7 +49,7 @@ def fields(truth: Trajectory, prediction: Trajectory | None = None) -> Fields:
     if shown.stress is not None:
         place = point if shown.stress_at == "node" else cell
         place["von_mises"] = shown.stress[:, :, 0]
-        if prediction is not None and truth.stress_at == shown.stress_at:
+        if prediction is not None and truth.stress is not None and truth.stress_at == shown.stress_at:
             place["von_mises_error"] = place["von_mises"] - truth.stress[:, :, 0]
     for name, one in shown.fields.items():
         place = point if one.location == "node" else cell
@@ -101,15 +101,10 @@ def displacement_rmse(truth: Trajectory, position: np.ndarray) -> np.ndarray:
     """
     normal = truth.scene.node_type == NodeType.NORMAL
     difference = position[:, normal].astype(np.float64) - truth.position[: len(position), normal]
-    return _root_mean_square(difference)
+    return root_mean_square(difference)
 
 
-def stress_rmse(truth: Trajectory, stress: np.ndarray) -> np.ndarray:
-    """[S] float64: root mean square of `stress` [S, N or E, 1] - truth outside the obstacles, for each frame."""
-    inside = truth.scene.deforming(truth.stress_at)
-    return _root_mean_square(stress[:, inside].astype(np.float64) - truth.stress[: len(stress), inside])
-
-
-def _root_mean_square(difference: np.ndarray) -> np.ndarray:
+def root_mean_square(difference: np.ndarray) -> np.ndarray:
+    """[S] float64: of each frame of `difference` [S, ...]; 0 where a frame has no numbers."""
     each = tuple(range(1, difference.ndim))
     return np.sqrt((difference**2).sum(axis=each) / max(np.prod(difference.shape[1:]), 1))

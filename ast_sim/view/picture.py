@@ -86,7 +86,7 @@ def _panels(sides: Sequence[Trajectory], names: Sequence[str], row: int, length_
     first = sides[0]
     by_stress = first.stress is not None and all(side.stress_at == first.stress_at for side in sides)
     label, unit = ("von Mises stress", "Pa") if by_stress else ("Displacement", length_unit)
-    values = [_corner_values(side, row, by_stress) for side in sides]
+    values = [_corner_values(side, row, side.stress if by_stress else None) for side in sides]
     view = View(first)
     body = values[0][~view.obstacle]
     upper = float(np.quantile(body, 0.99)) if body.size else 0.0
@@ -130,16 +130,16 @@ class View:
         return local[..., :2] / distance[..., None], distance
 
 
-def _corner_values(trajectory: Trajectory, frame: int, by_stress: bool) -> np.ndarray:
-    """[F, 3]: the coloured quantity at the corners of the surface triangles."""
+def _corner_values(trajectory: Trajectory, frame: int, stress: np.ndarray | None) -> np.ndarray:
+    """[F, 3]: the stress at the corners of the surface triangles; without a stress, the displacement."""
     scene = trajectory.scene
     surface = scene.surface()
-    if not by_stress:
+    if stress is None:
         return np.linalg.norm(trajectory.position[frame] - scene.rest_position, axis=1)[surface]
-    stress = trajectory.stress[frame, :, 0]
+    values = stress[frame, :, 0]
     if trajectory.stress_at == "node":
-        return stress[surface]
-    return np.repeat(stress[surface_owners(scene, surface), None], 3, axis=1)
+        return values[surface]
+    return np.repeat(values[surface_owners(scene, surface), None], 3, axis=1)
 
 
 def _draw(axes, view: View, position: np.ndarray, color_map, values: np.ndarray) -> None:

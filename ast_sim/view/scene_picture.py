@@ -70,7 +70,9 @@ def _draw(axes, scene: Scene, last: np.ndarray) -> None:
     edges = np.concatenate([np.tile(MESH_COLOR, (len(body), 1)), np.tile((*GHOST[:3], 0.25), (len(ghosts), 1))])
     flat, distance = view.project(corners)
     order = np.argsort(-distance.mean(axis=1), kind="stable")
-    axes.add_collection(PolyCollection(flat[order], facecolors=colors[order], edgecolors=edges[order], linewidths=0.3))
+    axes.add_collection(
+        PolyCollection(list(flat[order]), facecolors=colors[order], edgecolors=edges[order], linewidths=0.3)
+    )
     still = scene.prescribed & ~moved
     for nodes, color in ((still, STILL), (scene.prescribed & moved, MOVING)):
         dots, _ = view.project(rest[nodes])

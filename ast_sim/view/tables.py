@@ -218,13 +218,13 @@ def samples(evaluations: Sequence[Figures | None], names: Sequence[str]) -> Json
     }
 
 
-def training_curves(metrics: Sequence[Json]) -> tuple[list[Json], list[Json]]:
+def training_curves(metrics: Sequence[Mapping[str, Any]]) -> tuple[list[Json], list[Json]]:
     """The training losses and the validation errors by step, from the lines of `metrics.jsonl`."""
     losses = _curves(metrics, {"loss": "Loss", "motion": "Motion", "stress": "Stress"})
     return losses, _curves(metrics, {"valid_rmse": "Model", "valid_hold_still": "Hold still"})
 
 
-def _curves(metrics: Sequence[Json], labels: Mapping[str, str]) -> list[Json]:
+def _curves(metrics: Sequence[Mapping[str, Any]], labels: Mapping[str, str]) -> list[Json]:
     curves = []
     for key, label in labels.items():
         points = [(m["step"], m[key]) for m in metrics if isinstance(m.get(key), int | float)]

@@ -135,7 +135,7 @@ def test_numbers_and_times_of_frames_travel_with_a_trajectory(tmp_path):
     ("changes", "message"),
     [
         ({"frames": (0, 1)}, "frames has 2 numbers for 3 frames"),
-        ({"frames": (0, 2, 2)}, r"frames must be finite and ascend: \[0, 2, 2\]"),
+        ({"frames": (0, 2, 2)}, r"frames must be whole numbers and ascend: \[0, 2, 2\]"),
         ({"frames": (-1, 0, 1)}, "frames starts at -1; the first frame of a motion is 0"),
         ({"times": (0.0, float("nan"), 1.0)}, "times must be finite and ascend"),
         ({"length_unit": "mm"}, "train/000000 has lengths in mm, the dataset in m"),

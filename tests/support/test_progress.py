@@ -64,7 +64,7 @@ def test_a_bar_on_a_terminal(monkeypatch, capsys):
 
 
 def test_what_is_no_progress_is_refused():
-    with pytest.raises(ConfigError, match="progress is 'yes': it must be True, False or a function of"):
+    with pytest.raises(ConfigError, match="progress is 'yes'; it must be True, False or a function of"):
         Progress(1, "scenes", "yes")
 
 

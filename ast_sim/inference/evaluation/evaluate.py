@@ -168,7 +168,7 @@ def _training_means(dataset: Dataset, outputs: Sequence[Output]) -> dict[str, fl
     """The mean of the stress and of each named field in the training split, where they count; 0 where there is none."""
     totals = dict.fromkeys((output.name for output in outputs), 0.0)
     numbers = dict.fromkeys(totals, 0)
-    for _, trajectory in dataset.spread("train", MEAN_TRAJECTORIES, totals) if totals else ():
+    for _, trajectory in dataset.spread("train", MEAN_TRAJECTORIES, list(totals)) if totals else ():
         for name, location, *_ in outputs:
             if name == STRESS or name in trajectory.fields:
                 values = values_of(trajectory, name)[:, where_it_counts(trajectory.scene, name, location)]

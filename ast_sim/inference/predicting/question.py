@@ -156,6 +156,8 @@ def _whole_numbers(frames: WantedFrames, count: int) -> list[int]:
             return list(range(count)[frames])
         except (TypeError, ValueError) as error:  # bounds that are no whole numbers, or a step of 0
             raise ConfigError(wrong) from error
+    if isinstance(frames, Mapping):
+        raise ConfigError(wrong)
     listed = np.asarray(list(frames) if isinstance(frames, Iterable) else [frames])
     if listed.size and (listed.ndim != 1 or listed.dtype.kind not in "iu"):
         raise ConfigError(wrong)

@@ -58,7 +58,7 @@ def main() -> None:
         answer({"error": f"{type(error).__name__}: {error}"})
 
 
-def outcomes_of(task: dict[str, Any]) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+def outcomes_of(task: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     """Solve a task: the facts as JSON values, and the positions of outcome i by the name "i"."""
     recipe = Recipe(**task["recipe"])
     with Dataset(task["dataset"]) as dataset:

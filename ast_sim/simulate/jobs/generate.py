@@ -173,10 +173,10 @@ def _make(
         for note in (*notes, *(f"{name} failed before: {why}" for name, why in manifest.failures.items())):
             bar.line(note)
         watch = Watch(manifest, bar)
-        if missing and scheduler is None:
-            pool.run_all(missing, folder, recipe, workers, watch)
-        elif missing:
+        if missing and scheduler is not None:
             cluster.run_all(missing, folder, recipe, scheduler, watch)
+        elif missing:
+            pool.run_all(missing, folder, recipe, workers, watch)
     if watch.failures:
         listing = "; ".join(f"{sample_name(*sample)}: {text}" for sample, text in list(watch.failures.items())[:3])
         raise SimulationError(

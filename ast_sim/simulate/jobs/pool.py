@@ -51,16 +51,18 @@ class Process:
             bufsize=0,
             start_new_session=True,  # an interrupt from the terminal reaches only the parent
         )
+        assert self.process.stdin is not None and self.process.stdout is not None
+        self._stdin, self._stdout = self.process.stdin, self.process.stdout
         self._unfinished = b""  # the beginning of a line whose end has not come yet
 
     def fileno(self) -> int:
         """The file descriptor that becomes readable when the worker has said something."""
-        return self.process.stdout.fileno()
+        return self._stdout.fileno()
 
     def say(self, line: str) -> None:
         """Write a line to its standard input."""
         with contextlib.suppress(BrokenPipeError):  # `receive` reports a dead worker
-            self.process.stdin.write(f"{line}\n".encode())
+            self._stdin.write(f"{line}\n".encode())
 
     def receive(self) -> list[dict[str, Any]]:
         """Wait until the worker says something; return its messages. If it has ended, the message is an error that says
@@ -79,9 +81,9 @@ class Process:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self.process.pid, signal.SIGKILL)  # it leads a session and a process group of its own
         self.process.wait()
-        self.process.stdout.close()
+        self._stdout.close()
         with contextlib.suppress(BrokenPipeError):
-            self.process.stdin.close()
+            self._stdin.close()
 
 
 class Worker(Process):
@@ -91,11 +93,15 @@ class Worker(Process):
         folder: where it stores finished samples.
         recipe: the recipe of all its samples.
         checkpoints: where it stores unfinished samples; `folder` if None.
+
+    Attributes:
+        sample: the sample that it was given last.
     """
+
+    sample: Sample
 
     def __init__(self, folder: Path, recipe: Recipe, checkpoints: Path | None = None) -> None:
         super().__init__(WORKER_MODULE, str(folder), str(checkpoints or folder), json.dumps(asdict(recipe)))
-        self.sample: Sample | None = None
 
     def give(self, sample: Sample) -> None:
         self.sample = sample
@@ -116,7 +122,7 @@ class WorkerPool:
     def start_worker(self) -> None:
         worker = Worker(self.parts, self.recipe)
         self.active.append(worker)
-        self.selector.register(worker, selectors.EVENT_READ)
+        self.selector.register(worker, selectors.EVENT_READ, worker)
         self.give(worker)
 
     def give(self, worker: Worker) -> None:
@@ -161,8 +167,8 @@ def run_all(samples: list[Sample], parts: Path, recipe: Recipe, workers: int, wa
             pool.start_worker()
         while pool.active:
             for key, _ in pool.selector.select(timeout=1.0):
-                for message in key.fileobj.receive():
-                    pool.hear(key.fileobj, message)
+                for message in key.data.receive():
+                    pool.hear(key.data, message)
             watch.tick()
     finally:
         for worker in list(pool.active):

@@ -39,10 +39,10 @@ def checked_recipe(
     nodes: int | None,
     frames: int | None,
     solver: str | None,
-    parts: str | Path | None,
+    parts: str | os.PathLike[str] | None,
     patient: bool = False,
     keep: Sequence[int] | None = None,
-    spec: str | Path | None = None,
+    spec: str | os.PathLike[str] | None = None,
     order: int | None = None,
 ) -> Recipe:
     """The recipe with these settings, after a check. A setting that is None takes the family's default.
@@ -57,10 +57,13 @@ def checked_recipe(
             having = ", ".join(key for key, known in FAMILIES.items() if name in known.options)
             raise ConfigError(f"{family} has no option {name}; these families have it: {having}")
     nodes = module.DEFAULT_NODES if nodes is None else nodes
+    yielding: tuple[str, ...] = ()
     if "spec" in FAMILIES[family].options:
         if spec is None:
             raise ConfigError(f"{family} needs a specification: spec=FILE (ast-sim generate {family} FILE --out DATA)")
-        frames = read_spec(spec).frames if frames is None else frames
+        read = read_spec(spec)
+        frames = read.frames if frames is None else frames
+        yielding = read.yielding
     if "frames" in FAMILIES[family].options:
         frames = module.FRAMES if frames is None else frames
         if frames < module.MINIMUM_FRAMES:
@@ -73,7 +76,6 @@ def checked_recipe(
         raise ConfigError(f"seed is {seed}; must be from 0 to 2^63 - 1, the largest number that the file can hold")
     if nodes is not None and nodes < fewest:
         raise ConfigError(f"nodes is {nodes}; must be at least {fewest}")
-    yielding = () if spec is None else read_spec(spec).yielding
     solver = solver or ("calculix" if yielding else "own")
     if solver == "own" and yielding:
         raise ConfigError(
@@ -85,11 +87,11 @@ def checked_recipe(
     if patient and solver != "own":
         raise ConfigError(f"patient is for the own solver; {solver} has limits of its own")
     if parts is not None:
-        _source(parts)
+        _source(parts := file_name(parts, "parts"))
     if keep is not None:
         keep = _checked_keep(keep, (frames or module.FRAMES) - 1)
-    parts = None if parts is None else str(file_name(parts, "parts").resolve())
-    spec = None if spec is None else str(file_name(spec, "spec").resolve())
+    parts = None if parts is None else str(Path(parts).resolve())
+    spec = None if spec is None else str(Path(spec).resolve())
     return Recipe(family, seed, nodes, frames, solver, parts, spec, patient, keep, order)
 
 
@@ -118,12 +120,13 @@ def recipe_of(name: str, info: DatasetInfo, made_from: str | os.PathLike[str] | 
         raise ConfigError(f"{name} was made of {own[key]}: say where to find that: made_from=PATH (--made-from PATH)")
     parts, spec = (None if made_from is None or key != which else file_name(made_from, "made_from") for which in own)
     try:
-        numbers = whole(seed=made["seed"], nodes=made.get("nodes"), frames=made.get("frames"))
+        seed, nodes, frames = whole(seed=made["seed"], nodes=made.get("nodes"), frames=made.get("frames"))
     except (KeyError, ConfigError) as error:
         raise ConfigError(f"{name}: its settings cannot be read ({error!r})") from error
     try:
         keep, order = made.get("keep"), made.get("order")
-        recipe = checked_recipe(family_module(family), family, *numbers, None, parts, False, keep, spec, order)
+        module = family_module(family)
+        recipe = checked_recipe(module, family, seed, nodes, frames, None, parts, False, keep, spec, order)
     except TypeError as error:
         raise ConfigError(f"{name}: its settings cannot be read ({error!r})") from error
     if parts is not None and _source(parts).describe().get("parts") != made["parts"]:
@@ -189,12 +192,13 @@ def check_parts(recipe: Recipe) -> None:
     if recipe.spec is not None:
         from ast_sim.simulate.families import assembly
 
+        assert recipe.frames is not None  # the specification has them
         assembly.check_spec(read_spec(recipe.spec), recipe.nodes, recipe.frames, recipe.keep)
     if recipe.parts is not None:
         _source(recipe.parts).check()
 
 
-def _source(parts: str | Path | None) -> PartSource:
+def _source(parts: str | os.PathLike[str] | None) -> PartSource:
     from ast_sim.simulate.shapes.part_source import part_source
 
     return part_source(None if parts is None else Path(parts))

@@ -151,18 +151,15 @@ def store_sample(path: Path, data: bytes) -> None:
 def pack_sample(trajectory: Trajectory, seconds: Seconds | None = None) -> bytes:
     """A sample as the bytes of its file; with the seconds of its attributes, on this processor, if none are given."""
     kept, taken = split_seconds(trajectory.attributes)
-    arrays = {key: getattr(trajectory.scene, key) for key in _SCENE}
+    arrays: dict[str, Any] = {key: getattr(trajectory.scene, key) for key in _SCENE}
     arrays |= {key: getattr(trajectory, key) for key in _FRAMED}
     arrays |= {FIELD + name: one.values for name, one in trajectory.fields.items()}
     places = {name: [one.location, one.unit] for name, one in trajectory.fields.items()}
     seconds = {**taken, "processor": processor()} if seconds is None else seconds
     texts = {"attributes": kept, "fields": places, "seconds": seconds}
+    arrays |= {key: np.array(json.dumps(value)) for key, value in texts.items()}
     file = io.BytesIO()
-    np.savez(
-        file,
-        **{key: array for key, array in arrays.items() if array is not None},
-        **{key: np.array(json.dumps(value)) for key, value in texts.items()},
-    )
+    np.savez(file, **{key: array for key, array in arrays.items() if array is not None})
     return file.getvalue()
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 from ast_sim.support.errors import ConfigError, nearest_name
 
-_OPERATORS: dict[type, Callable[..., float]] = {
+_OPERATORS: dict[type, Callable[..., Any]] = {
     ast.Add: operator.add,
     ast.Sub: operator.sub,
     ast.Mult: operator.mul,
@@ -21,7 +21,7 @@ _OPERATORS: dict[type, Callable[..., float]] = {
     ast.USub: operator.neg,
     ast.UAdd: operator.pos,
 }
-FUNCTIONS: dict[str, Callable[..., float]] = {
+FUNCTIONS: dict[str, Callable[..., Any]] = {
     "sin": lambda angle: math.sin(math.radians(angle)),
     "cos": lambda angle: math.cos(math.radians(angle)),
     "tan": lambda angle: math.tan(math.radians(angle)),

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ast_sim.support.argument_checks import file_name
+from ast_sim.support.argument_checks import file_name, require_type
 from ast_sim.support.disk import read_text
 from ast_sim.support.errors import ConfigError
 
@@ -68,6 +68,7 @@ def grid(values: Mapping[str, Any]) -> list[dict[str, Any]]:
     Raises:
         ConfigError: a parameter has no value or is given twice, or there are too many rows.
     """
+    require_type("parameters", values, Mapping, "values by name, such as {'travel': [1, 2]}")
     flat: dict[str, Sequence[Any]] = {}
     for name, value in values.items():
         inner = {f"{part}.{name}": v for part, v in value.items()} if isinstance(value, Mapping) else {name: value}

@@ -66,7 +66,7 @@ def _thin(spec: AssemblySpec, case: SolidCase, number: int) -> Iterator[Limit]:
     rest = case.scene.rest_position.astype(np.float64)
     faces = surface_of(case, number)
     middle, thickness, other = _across(rest, faces)
-    held = case.scene.prescribed[faces].all(axis=1)
+    held = np.all(case.scene.prescribed[faces], axis=1)
     wall = np.flatnonzero((other >= 0) & ~held & ~held[other])
     few = wall[_elements_across(case, number, faces[wall], faces[other[wall]]) < ENOUGH]
     if not len(few):
@@ -96,7 +96,7 @@ def _across(rest: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray
     tree = igl.AABB()
     rows = faces.astype(np.int64)
     tree.init(rest, rows)
-    hit, distance, _ = tree.intersect_ray_first(rest, rows, middle - inward * normal, -normal)
+    hit, distance = map(np.asarray, tree.intersect_ray_first(rest, rows, middle - inward * normal, -normal)[:2])
     parallel = np.einsum("fi,fi->f", normal, normal[hit]) <= OPPOSITE
     return middle, distance, np.where((hit >= 0) & parallel, hit, -1)
 

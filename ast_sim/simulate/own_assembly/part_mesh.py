@@ -124,7 +124,7 @@ def part_meshes(spec: AssemblySpec, values: Values, factor: float = 1.0, halved:
 
 def _request(spec: AssemblySpec, part: PartSpec, values: Values, factor: float, halved: bool) -> dict[str, Any]:
     """All that the mesh of a part depends on; with "size", it is a request to gmsh."""
-    file = str(values[f"{part.name}.file"]) if len(part.files) > 1 else part.files[0]
+    file = part.files[0] if len(part.files) == 1 else str(values[f"{part.name}.file"])
     path = spec.file(file)
     changed = path.stat()
     kind = path.suffix.lower()
