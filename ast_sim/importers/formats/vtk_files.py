@@ -29,11 +29,12 @@ from ast_sim.importers.formats.declared_sizes import (
     needed_bytes,
     stored_in_hdf,
 )
-from ast_sim.importers.formats.frd_results import given_up, read_frd_headers
+from ast_sim.importers.formats.frd_given_up import is_left_out
+from ast_sim.importers.formats.frd_results import read_frd_headers
 from ast_sim.importers.formats.source_mesh import SourceMesh
 from ast_sim.importers.formats.together import labels_of, together
 from ast_sim.importers.formats.vtk_cells import blocks_of
-from ast_sim.support.errors import DatasetError, require, warn
+from ast_sim.support.errors import DatasetError, require
 
 READING_MODULE = "ast_sim.importers.formats.reading_worker"
 EXODUS = (".e", ".ex2", ".exo", ".exoii", ".exii", ".g", ".gen")
@@ -82,20 +83,9 @@ def vtk_frames(path: Path) -> Iterator[SourceMesh]:
         declared = declared or ([sum(column) for column in zip(*pieces, strict=True)] if pieces else None)
         _require_counts(mesh, declared)
         step += 1
-        if path.suffix.lower() == ".frd" and step == steps and _is_given_up(path):
+        if step == steps and is_left_out(path, head.get("given_up", False), steps, head["time"]):
             return
         yield _without_ghosts(_with_pieces(mesh, pieces, _piece_names(path)))
-
-
-def _is_given_up(path: Path) -> bool:
-    """Whether the last increment of a job did not converge; a warning says that it is left out."""
-    time = given_up(path, read_frd_headers(path)[1])
-    if time is not None:
-        warn(
-            f"{path}: the job did not converge: the increment at the time {time:g} is the state in which CalculiX gave"
-            " up, and is left out"
-        )
-    return time is not None
 
 
 @contextlib.contextmanager
