@@ -1,5 +1,6 @@
 """What looks wrong in the frames of a simulation: tools that change their shape, displacements in other units, elements
-that turn over, frames that repeat, bodies that change their places, no motion, contact that no model can see.
+that turn over, frames that repeat, bodies that change their places, displacements from the frame before, no motion,
+contact that no model can see.
 
 Legend: S frames, N nodes, E elements.
 """
@@ -14,6 +15,7 @@ from ast_sim.element_topology import signed_volumes
 from ast_sim.number_arrays import point
 from ast_sim.plausibility.body_places import change_places
 from ast_sim.plausibility.findings import Finding, places
+from ast_sim.plausibility.increments import counted_from_frame_before
 from ast_sim.plausibility.topology import at_rest
 from ast_sim.scene import Scene, Trajectory
 
@@ -40,7 +42,8 @@ def in_trajectory(trajectory: Trajectory) -> list[Finding]:
     scene, position = trajectory.scene, trajectory.position
     findings = [*at_rest(scene), *_still(scene, position), *_far(scene, position), *_soft_tools(scene, position)]
     findings += [*_turn_over(scene, position), *_repeats(position, trajectory.stress)]
-    return [*findings, *change_places(scene, position), *_contact(scene, position)]
+    findings += [*change_places(scene, position), *counted_from_frame_before(scene, position)]
+    return [*findings, *_contact(scene, position)]
 
 
 def _still(scene: Scene, position: np.ndarray) -> list[Finding]:
