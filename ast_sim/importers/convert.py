@@ -14,9 +14,11 @@ from ast_sim.dataset.layout import SPLITS
 from ast_sim.dataset.writer import FittedWriter
 from ast_sim.importers.completeness import require_complete
 from ast_sim.importers.deepmind import convert_deepmind, is_deepmind
-from ast_sim.importers.frame_order import SERIES, files_of_frames, natural_order
 from ast_sim.importers.frames_in_file import ONE_FRAME, WITH_FRAMES, holds_frames
 from ast_sim.importers.job_files import decks_of, doubt_modulus, with_units
+from ast_sim.importers.order_of_files.by_name import natural_order
+from ast_sim.importers.order_of_files.frame_files import files_of_frames
+from ast_sim.importers.order_of_files.listed import SERIES
 from ast_sim.importers.series import FieldNames, read_series
 from ast_sim.plausibility.findings import Finding, refusal, told
 from ast_sim.plausibility.motion import in_trajectory

@@ -12,10 +12,12 @@ from typing import Any
 import numpy as np
 
 from ast_sim.importers.formats.source_mesh import SourceMesh
-from ast_sim.importers.formats.together import labelled, together
-from ast_sim.importers.frame_order import frame_files, ordered
+from ast_sim.importers.formats.together import labelled, require_one_time, together
 from ast_sim.importers.frames_in_file import frames_in
 from ast_sim.importers.mesh_file import MeshFile, mesh_of, raw_field
+from ast_sim.importers.order_of_files.by_name import ordered
+from ast_sim.importers.order_of_files.doubts import doubts_of_times
+from ast_sim.importers.order_of_files.frame_files import frame_files
 from ast_sim.importers.scene_mesh import clamped
 from ast_sim.importers.solids.frames_match import in_order_of, order_of_cells
 from ast_sim.importers.solids.kept_fields import KeptFields
@@ -214,13 +216,15 @@ def _read_frames(
                 f"{frame.path}: holds 'von_mises', which the first frame lacks: write it into each frame, or into none"
             )
     assert first is not None and stitching is not None
-    files, times, _ = frame_files(source)
+    files, times, _, said = frame_files(source)
+    notes += said
     if source.is_dir():
         by_time, said = ordered([file for (file,) in files], kept.times)
         kept.reorder(by_time)
         further.reorder(by_time)
         notes += said
     elif times is not None:
+        notes += doubts_of_times(source, times, kept.times)
         kept.times = list(times)
     else:
         notes += kept.doubts()
@@ -234,7 +238,9 @@ def frames(source: Path) -> Iterator[SourceMesh]:
         if len(files) > 1:
             labels = of_frames.labels or [""] * len(files)
             pairs = zip(files, labels, strict=True)
-            yield together([labelled(next(frames_in(file)), label) for file, label in pairs])
+            parts = [labelled(next(frames_in(file)), label) for file, label in pairs]
+            require_one_time(parts)
+            yield together(parts)
         elif source.is_dir():
             yield next(frames_in(files[0]))
         else:
