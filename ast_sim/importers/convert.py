@@ -200,19 +200,21 @@ def find_series(source: Path) -> dict[str, Path]:
 
 def _series_in(folder: Path) -> Iterator[Path]:
     """The simulations in a folder. If it holds files with all frames or .pvd files, only these count; else .series
-    files, if there are any: both list files of frames."""
+    files, if there are any: both list files of frames. Files of Gmsh count if there is nothing else."""
     entries = sorted(folder.iterdir(), key=natural_order)
     files = [entry for entry in entries if entry.is_file() and not entry.name.startswith(".")]
     collections = [entry for entry in files if entry.suffix.lower() == ".pvd" or holds_frames(entry)]
     collections = collections or [entry for entry in files if entry.suffix.lower() == SERIES]
     if collections:
         yield from collections
-    elif files_of_frames(folder):
+        return
+    of_frames = files_of_frames(folder)
+    meshes = all(file.suffix.lower() == ".msh" for file in of_frames)  # frames if nothing else is there
+    if of_frames and not meshes:
         yield folder
-    else:
-        for entry in entries:
-            if entry.is_dir() and not entry.name.startswith("."):
-                yield from _series_in(entry)
+        return
+    inner = [series for entry in entries if entry.is_dir() and entry.name[0] != "." for series in _series_in(entry)]
+    yield from inner or ([folder] if len(of_frames) > 1 else [])
 
 
 def _assign(

@@ -19,14 +19,16 @@ from ast_sim.importers.decks.deck_mesh import deck_mesh
 from ast_sim.importers.formats.gmsh_files import gmsh_mesh
 from ast_sim.importers.formats.source_mesh import CellBlock, SourceMesh, from_meshio
 from ast_sim.importers.formats.stl_file import BadSurface, read_stl
-from ast_sim.importers.formats.vtk_files import ENDINGS, is_dyna, vtk_frames
+from ast_sim.importers.formats.vtk_files import BLOCKS, ENDINGS, is_dyna, vtk_frames
 from ast_sim.support.errors import DatasetError
 
 # Formats whose files hold all frames of a simulation.
 WITH_FRAMES = (".vtkhdf", ".frd", ".xdmf", ".xmf", ".e", ".ex2", ".exo", ".exoii", ".exii")
 
 # Formats in which each frame is a file of its own.
-ONE_FRAME = (".vtu", ".pvtu", ".vtk", ".vtp", ".pvtp", ".vtm", ".vtmb")
+ONE_FRAME = (".vtu", ".pvtu", ".vtk", ".vtp", ".pvtp", ".vts", ".pvts", *BLOCKS, ".msh")
+
+_INSTEAD = "write it as .vtu, .vtk, .msh or .inp"
 
 
 def holds_frames(path: Path) -> bool:
@@ -84,7 +86,9 @@ def _by_meshio(path: Path, copy: Path | None = None) -> SourceMesh:
         with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
             mesh = meshio.read(copy or path)
     except (Exception, SystemExit) as error:
-        raise DatasetError(f"{path}: cannot be read as a mesh: {_told(error, printed.getvalue())}") from error
+        told = _told(error, printed.getvalue()).replace(str(copy), str(path))
+        more = "" if _INSTEAD in told else f"; if it is whole, {_INSTEAD}"
+        raise DatasetError(f"{path}: cannot be read as a mesh: {told}{more}") from error
     return from_meshio(mesh, path)
 
 
@@ -101,6 +105,8 @@ def _told(error: BaseException, printed: str = "") -> str:
     """What meshio says on a file that it cannot read, in one line."""
     from meshio import ReadError
 
+    if "Could not deduce file format" in str(error):
+        return f"files of this kind are not read; {_INSTEAD}"
     if isinstance(error, SystemExit | OSError | ReadError):
         told = " ".join(f"{printed} {error if str(error) != '1' else ''}".split())
         return told or "meshio cannot read it"
@@ -122,7 +128,13 @@ def _xdmf_frames(path: Path) -> Iterator[SourceMesh]:
         raise DatasetError(f"{path}: cannot be read as a mesh: it is no XML: {error}") from error
     _require_understood(path, tree)
     series = tree.findall("Domain/Grid[@GridType='Collection']")
-    with _beside(path, tree) as copy:
+    version = str(tree.getroot().get("Version"))
+    if series and version.partition(".")[0] != "3":
+        raise DatasetError(
+            f"{path}: is XDMF of the version {version}; write a series of version 3 (Xdmf3 in ParaView), .vtkhdf or"
+            " .pvd"
+        )
+    with _beside(path, tree, _with_grid_types(tree)) as copy:
         if not series:
             yield _by_meshio(path, copy)
             return
@@ -142,6 +154,14 @@ def _xdmf_frames(path: Path) -> Iterator[SourceMesh]:
             raise
         except (Exception, SystemExit) as error:
             raise DatasetError(f"{path}: cannot be read as a mesh: {_told(error)}") from error
+
+
+def _with_grid_types(tree: ET.ElementTree[Any]) -> bool:
+    """Write out that a grid is uniform where it says no type; meshio needs that. Whether there is such a grid."""
+    plain = [grid for grid in tree.iter("Grid") if grid.get("GridType") is None]
+    for grid in plain:
+        grid.set("GridType", "Uniform")
+    return bool(plain)
 
 
 def _own_mesh(reader: Any, grid: ET.Element, shared: tuple[Any, Any]) -> tuple[Any, Any]:
@@ -192,9 +212,9 @@ def _require_plain(path: Path, series: list[ET.Element]) -> None:
 
 
 @contextlib.contextmanager
-def _beside(path: Path, tree: ET.ElementTree[Any]) -> Iterator[Path]:
-    """An XDMF file; or a copy, if numbers stand in binary files beside it, which meshio looks for in the folder in
-    which the process runs: the copy names them in full."""
+def _beside(path: Path, tree: ET.ElementTree[Any], changed: bool) -> Iterator[Path]:
+    """An XDMF file; or a copy, if its tree was changed, or if numbers stand in binary files beside it, which meshio
+    looks for in the folder in which the process runs: the copy names them in full."""
     binary = [item for item in tree.iter("DataItem") if item.get("Format") == "Binary" and item.text]
     for item in binary:
         if item.get("Endian") == "Big" or item.get("Seek", "0") != "0" or item.get("Compression", "Raw") != "Raw":
@@ -202,7 +222,7 @@ def _beside(path: Path, tree: ET.ElementTree[Any]) -> Iterator[Path]:
                 f"{path}: its binary numbers must be plain ones of this machine, from the start of a file"
             )
         item.text = str(path.parent.resolve() / str(item.text).strip())
-    if not binary:
+    if not binary and not changed:
         yield path
         return
     with tempfile.TemporaryDirectory() as folder:

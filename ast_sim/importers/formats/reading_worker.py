@@ -197,8 +197,11 @@ def _xml_or_legacy(path: Path, ending: str) -> Any:
             ".vtp": "PolyData",
             ".pvtp": "PPolyData",
             ".vts": "StructuredGrid",
+            ".pvts": "PStructuredGrid",
             ".vtm": "MultiBlockData",
             ".vtmb": "MultiBlockData",
+            ".vtpc": "PartitionedDataSetCollection",
+            ".vtpd": "PartitionedDataSet",
         }[ending]
         reader = getattr(vtkIOXML, f"vtkXML{name}Reader")()
     reader.SetFileName(_name(path))

@@ -38,7 +38,8 @@ from ast_sim.support.errors import DatasetError, require
 
 READING_MODULE = "ast_sim.importers.formats.reading_worker"
 EXODUS = (".e", ".ex2", ".exo", ".exoii", ".exii", ".g", ".gen")
-XML = (".vtu", ".pvtu", ".vtp", ".pvtp", ".vts", ".vtm", ".vtmb")
+BLOCKS = (".vtm", ".vtmb", ".vtpc", ".vtpd")  # list the files of blocks
+XML = (".vtu", ".pvtu", ".vtp", ".pvtp", ".vts", ".pvts", *BLOCKS)
 ENDINGS = (*XML, ".vtk", ".vtkhdf", *EXODUS, ".frd")
 
 # Memory for a file: that for what it declares, for VTK's copies of it, and for what VTK needs itself.
@@ -126,7 +127,7 @@ def _checked(path: Path) -> tuple[list[tuple[int, int]], int]:
     if ending in (".vtu", ".vtp", ".vts"):
         declared = declared_in_xml(path)
         return declared.pieces if ending != ".vts" else [], _OWN_BYTES + _COPIES * (needed_bytes(declared) + size)
-    if ending in (".pvtu", ".pvtp", ".vtm", ".vtmb"):
+    if ending in (".pvtu", ".pvtp", ".pvts", *BLOCKS):
         return _of_pieces(path)
     if ending == ".vtkhdf" or (ending in EXODUS and _is_hdf(path)):
         return [], _OWN_BYTES + _COPIES * stored_in_hdf(path, "VTKHDF" if ending == ".vtkhdf" else "/")
@@ -141,7 +142,7 @@ def _checked(path: Path) -> tuple[list[tuple[int, int]], int]:
 def _of_pieces(path: Path) -> tuple[list[tuple[int, int]], int]:
     """As `_checked`, of a file that lists the files of its pieces or blocks."""
     listed = declared_in_xml(path).sources
-    if path.suffix.lower() in (".vtm", ".vtmb"):
+    if path.suffix.lower() in BLOCKS:
         listed = [entry.attrib["file"] for entry in ElementTree.parse(path).iter("DataSet") if entry.get("file")]
     pieces, budget = [], _OWN_BYTES
     for name in listed:

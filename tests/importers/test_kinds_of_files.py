@@ -1,0 +1,134 @@
+"""Kinds of files with one frame each: read as series, or refused with what to do."""
+
+import meshio
+import numpy as np
+import pytest
+import pyvista
+from blocks import block
+from vtkmodules.vtkCommonDataModel import vtkPartitionedDataSet, vtkPartitionedDataSetCollection
+from vtkmodules.vtkIOParallelXML import vtkXMLPartitionedDataSetCollectionWriter, vtkXMLPartitionedDataSetWriter
+
+from ast_sim.importers.convert import find_series
+from ast_sim.importers.mesh_file import read_mesh
+from ast_sim.importers.series import FieldNames, read_series
+from ast_sim.support.errors import DatasetError
+
+CUBE = block(1, 1, 1)
+NAMES = FieldNames(handle="0:zmin")
+
+
+def pressed(frame):
+    return CUBE.rest_position * (1, 1, 1 - 0.1 * frame)
+
+
+def grid(points):
+    return pyvista.from_meshio(meshio.Mesh(points, [("tetra", CUBE.elements)]))
+
+
+def write_partitions(path, frame):
+    one, other = grid(pressed(frame)), grid(CUBE.rest_position + (0, 0, 1.5 - 0.1 * frame))
+    if path.suffix == ".vtpd":
+        data, writer = vtkPartitionedDataSet(), vtkXMLPartitionedDataSetWriter()
+        data.SetPartition(0, one)
+        data.SetPartition(1, other)
+    else:
+        data, writer = vtkPartitionedDataSetCollection(), vtkXMLPartitionedDataSetCollectionWriter()
+        data.SetPartition(0, 0, one)
+        data.SetPartition(1, 0, other)
+    writer.SetInputData(data)
+    writer.SetFileName(str(path))
+    writer.Write()
+
+
+def write_structured(path, frame):
+    """A cube of 8 cells; a .pvts file lists the .vts file of its one piece."""
+    axis = np.arange(3.0) / 2
+    x, y, z = np.meshgrid(axis, axis, axis * (1 - 0.1 * frame), indexing="ij")
+    pyvista.StructuredGrid(x, y, z).save(path.with_suffix(".vts"))
+    if path.suffix == ".pvts":
+        points = '<PPoints><PDataArray type="Float64" NumberOfComponents="3"/></PPoints>'
+        piece = f'<Piece Extent="0 2 0 2 0 2" Source="{path.stem}.vts"/>'
+        inner = f'<PStructuredGrid WholeExtent="0 2 0 2 0 2" GhostLevel="0">{points}{piece}</PStructuredGrid>'
+        path.write_text(f'<VTKFile type="PStructuredGrid" version="0.1">{inner}</VTKFile>')
+
+
+def write_gmsh(path, frame):
+    meshio.Mesh(pressed(frame), [("tetra", CUBE.elements)]).write(path, file_format="gmsh")
+
+
+@pytest.mark.parametrize(
+    ("ending", "write", "nodes"),
+    [
+        ("vtpd", write_partitions, 16),
+        ("vtpc", write_partitions, 16),
+        ("vts", write_structured, 27),
+        ("pvts", write_structured, 27),
+        ("msh", write_gmsh, 8),
+    ],
+)
+def test_a_file_for_each_frame_is_read(tmp_path, ending, write, nodes):
+    """The folders with the pieces of .vtpd and .vtpc files are no simulations."""
+    listed = ""
+    for frame in range(3):
+        write(tmp_path / f"f_{frame}.{ending}", frame)
+        listed += f'<DataSet timestep="{frame}" file="f_{frame}.{ending}"/>'
+    assert find_series(tmp_path) == {tmp_path.name: tmp_path}
+    of_folder = read_series(tmp_path, NAMES)
+    (tmp_path / "all.pvd").write_text(f'<VTKFile type="Collection"><Collection>{listed}</Collection></VTKFile>')
+    of_list = read_series(tmp_path / "all.pvd", NAMES)
+    for read in (of_folder, of_list):
+        np.testing.assert_allclose(np.ptp(read.position[:, read.scene.body == 0, 2], axis=1), (1, 0.9, 0.8), rtol=1e-6)
+        assert read.scene.num_nodes == nodes
+    assert of_list.times == (0, 1, 2)
+    assert "left out" not in of_folder.attributes.get("notes", "")
+
+
+def test_meshes_of_gmsh_beside_simulations_are_no_frames(tmp_path):
+    for frame in range(2):
+        write_gmsh(tmp_path / f"part_{frame}.msh", 0)
+        (tmp_path / "run").mkdir(exist_ok=True)
+        grid(pressed(frame)).save(tmp_path / "run" / f"f_{frame}.vtu")
+    assert find_series(tmp_path) == {"run": tmp_path / "run"}
+
+
+def test_frames_of_another_kind_that_are_left_out_are_told(tmp_path):
+    for frame in range(3):
+        grid(pressed(frame)).save(tmp_path / f"f_{frame}.vtu")
+    grid(pressed(0)).extract_surface(algorithm="dataset_surface").save(tmp_path / "tool.vtp")
+    notes = read_series(tmp_path, NAMES).attributes["notes"]
+    assert notes == "1 files of another kind beside the frames are left out: tool.vtp"
+
+
+@pytest.mark.parametrize("name", ["mesh.unv", "view.pos", "mesh.key"])
+def test_other_kinds_are_refused_with_what_to_do(tmp_path, name):
+    (tmp_path / name).write_text("    -1\n")
+    with pytest.raises(DatasetError, match=f"{name}: .*files of this kind are not read; write it as .vtu, .vtk, .msh"):
+        read_mesh(tmp_path / name)
+    with pytest.raises(DatasetError, match=f"{name}: must be a .pvd or .series file, a folder of files of frames"):
+        read_series(tmp_path / name, NAMES)
+
+
+def test_a_deck_of_nastran_as_gmsh_writes_it_is_refused_with_what_to_do(tmp_path):
+    (tmp_path / "mesh.bdf").write_text("$ Created by Gmsh\nGRID,1,0,0.,0.,0.\nENDDATA\n")
+    with pytest.raises(DatasetError, match="statement not found; if it is whole, write it as .vtu, .vtk, .msh or .inp"):
+        read_mesh(tmp_path / "mesh.bdf")
+
+
+def test_grids_of_xdmf_are_uniform_where_they_do_not_say(tmp_path):
+    def one(frame):
+        points = " ".join(map(str, pressed(frame).ravel()))
+        cells = " ".join(map(str, CUBE.elements.ravel()))
+        of_cells = f'<DataItem Dimensions="{len(CUBE.elements)} 4" Format="XML" NumberType="Int">{cells}</DataItem>'
+        of_points = f'<DataItem Dimensions="8 3" Format="XML" NumberType="Float" Precision="8">{points}</DataItem>'
+        topology = f'<Topology TopologyType="Tetrahedron" NumberOfElements="{len(CUBE.elements)}">{of_cells}</Topology>'
+        return f'<Grid><Time Value="{frame}"/>{topology}<Geometry GeometryType="XYZ">{of_points}</Geometry></Grid>'
+
+    series = "".join(map(one, range(3)))
+    series = f'<Domain><Grid GridType="Collection" CollectionType="Temporal">{series}</Grid></Domain>'
+    path = tmp_path / "all.xdmf"
+    path.write_text(f'<Xdmf Version="3.0">{series}</Xdmf>')
+    read = read_series(path, NAMES)
+    np.testing.assert_allclose(read.position[:, :, 2].max(axis=1), (1, 0.9, 0.8), rtol=1e-6)
+    path.write_text(f'<Xdmf Version="2.2">{series}</Xdmf>')
+    with pytest.raises(DatasetError, match="is XDMF of the version 2.2; write a series of version 3"):
+        read_series(path, NAMES)
