@@ -18,6 +18,7 @@ from ast_sim.importers.frames_in_file import ONE_FRAME, WITH_FRAMES, holds_frame
 from ast_sim.importers.job_files import decks_of, doubt_modulus, with_units
 from ast_sim.importers.order_of_files.by_name import natural_order
 from ast_sim.importers.order_of_files.frame_files import files_of_frames
+from ast_sim.importers.order_of_files.left_out import left_out
 from ast_sim.importers.order_of_files.listed import SERIES
 from ast_sim.importers.series import FieldNames, read_series
 from ast_sim.plausibility.findings import Finding, refusal, told
@@ -184,14 +185,16 @@ def find_series(source: Path) -> dict[str, Path]:
     """The simulations in a source by name, in natural order.
 
     Raises:
-        DatasetError: there is no simulation.
+        DatasetError: there is no simulation, or two have the same name.
     """
     if not source.is_dir():
         return {source.stem: source}
-    series = {
-        path.relative_to(source).with_suffix("").as_posix() if path != source else source.name: path
-        for path in _series_in(source)
-    }
+    series: dict[str, Path] = {}
+    for path in _series_in(source):
+        name = path.relative_to(source).with_suffix("").as_posix() if path != source else source.name
+        if name in series:
+            raise DatasetError(f"{path}: is the simulation {name!r}, and so is {series[name].name}: move one elsewhere")
+        series[name] = path
     if not series:
         known = ", ".join((".pvd", *WITH_FRAMES, *ONE_FRAME))
         raise DatasetError(f"{source}: neither the folder nor a folder in it holds files of results: {known}")
@@ -206,6 +209,8 @@ def _series_in(folder: Path) -> Iterator[Path]:
     collections = [entry for entry in files if entry.suffix.lower() == ".pvd" or holds_frames(entry)]
     collections = collections or [entry for entry in files if entry.suffix.lower() == SERIES]
     if collections:
+        for note in left_out(folder, collections):
+            warn(f"{folder}: {note}")
         yield from collections
         return
     of_frames = files_of_frames(folder)

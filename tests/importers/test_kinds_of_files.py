@@ -91,12 +91,27 @@ def test_meshes_of_gmsh_beside_simulations_are_no_frames(tmp_path):
     assert find_series(tmp_path) == {"run": tmp_path / "run"}
 
 
-def test_frames_of_another_kind_that_are_left_out_are_told(tmp_path):
+def test_results_that_are_left_out_are_told(tmp_path):
+    """Beside frames in a folder, and beside a list of files; not the pieces that a list names."""
+    (tmp_path / "sub").mkdir()
     for frame in range(3):
         grid(pressed(frame)).save(tmp_path / f"f_{frame}.vtu")
+        grid(pressed(frame)).save(tmp_path / "sub" / f"g_{frame}.vtu")
     grid(pressed(0)).extract_surface(algorithm="dataset_surface").save(tmp_path / "tool.vtp")
     notes = read_series(tmp_path, NAMES).attributes["notes"]
-    assert notes == "1 files of another kind beside the frames are left out: tool.vtp"
+    assert notes == f"2 other files or folders with results in {tmp_path.name} are left out: sub, tool.vtp"
+    listed = "".join(f'<DataSet timestep="{frame}" file="sub/g_{frame}.vtu"/>' for frame in range(3))
+    (tmp_path / "g.pvd").write_text(f'<VTKFile type="Collection"><Collection>{listed}</Collection></VTKFile>')
+    with pytest.warns(UserWarning, match="4 other files or folders with results in .* are left out: f_0.vtu, f_1.vtu,"):
+        assert list(find_series(tmp_path)) == ["g"]
+
+
+def test_two_simulations_of_one_name_are_refused(tmp_path):
+    """ccx2paraview writes job.pvd beside job.frd."""
+    for name in ("job.frd", "job.pvd"):
+        (tmp_path / name).touch()
+    with pytest.raises(DatasetError, match=r"job.pvd: is the simulation 'job', and so is job.frd: move one elsewhere"):
+        find_series(tmp_path)
 
 
 @pytest.mark.parametrize("name", ["mesh.unv", "view.pos", "mesh.key"])

@@ -1,6 +1,7 @@
 """PVD and .series files that list a file of another time or of another run are refused, or a note tells it."""
 
 import json
+import shutil
 
 import meshio
 import pytest
@@ -125,3 +126,12 @@ def test_blocks_of_a_frame_have_one_time(folder):
     blocks.save(folder / "m_2.vtm")
     with pytest.raises(DatasetError, match=r"its blocks are of different times \(0.2, 0.7\)"):
         read_series(pvd(folder, listed), NAMES)
+
+
+def test_times_in_a_folder_that_are_not_used_are_told(folder, tmp_path_factory):
+    files = tmp_path_factory.mktemp("files")
+    for frame, name in enumerate(("t_0", "t_1", "t_2", "t_1")):
+        shutil.copy(folder / f"{name}.vtu", files / f"f_{frame}.vtu")
+    assert notes(files) == "f_1.vtu and f_3.vtu say the same time 0.1: the times inside are not used"
+    shutil.copy(folder / "a_3.vtu", files / "f_3.vtu")
+    assert notes(files) == "f_3.vtu says no time, other files do: the times inside are not used"

@@ -98,3 +98,15 @@ def test_a_doubt_is_told_where_no_node_is_held(tmp_path):
     (tmp_path / "job.sta").unlink()
     with pytest.warns(UserWarning, match=r"its last increment, at the time 2, converged or is the state in which"):
         read_series(results, NAMES, deck=tmp_path / "job.inp")
+
+
+@pytest.mark.parametrize("output", ["*NODE FILE", "*NODE OUTPUT"])
+@pytest.mark.parametrize("lines", [2, 20, 40])
+def test_results_that_are_cut_off_are_refused(tmp_path, output, lines):
+    """A reader fills what is missing with zeros."""
+    results = job(tmp_path, (output, "U, RF"), (-0.1, -0.2))
+    content = results.read_bytes()
+    row = 12 if output == "*NODE OUTPUT" else 50
+    results.write_bytes(content[: len(content) - len(b" -3\n 9999\n") - lines * row])
+    with pytest.raises(DatasetError, match=r"job.frd: is cut off in (FORC|DISP) at the time 2: copy it whole, or"):
+        read_series(results, NAMES, deck=tmp_path / "job.inp")

@@ -12,6 +12,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -43,6 +44,12 @@ class FrdResult:
     format: int
     start: int
 
+    def is_whole(self, content: mmap.mmap) -> bool:
+        """Whether the file goes on to the end of its numbers; a reader fills what is missing with zeros."""
+        if self.format in _TEXT_WIDTHS:
+            return content.find(b"\n -3", self.start - 1) >= 0
+        return self.start + self.count * self._row.itemsize <= len(content)
+
     def nodes(self, content: mmap.mmap) -> np.ndarray:
         """[count] the numbers of the nodes that it has values for."""
         if self.format in _TEXT_WIDTHS:
@@ -61,8 +68,11 @@ class FrdResult:
 
     def _rows(self, content: mmap.mmap) -> np.ndarray:
         """The rows of a binary result: `node` and `values`."""
-        row = np.dtype([("node", "<i4"), ("values", f"<f{_BINARY_WIDTHS[self.format]}", self.columns)])
-        return np.frombuffer(content[self.start : self.start + self.count * row.itemsize], row)
+        return np.frombuffer(content[self.start : self.start + self.count * self._row.itemsize], self._row)
+
+    @property
+    def _row(self) -> np.dtype[Any]:
+        return np.dtype([("node", "<i4"), ("values", f"<f{_BINARY_WIDTHS[self.format]}", self.columns)])
 
 
 def read_frd_headers(path: Path) -> tuple[list[int], list[FrdResult]]:
@@ -78,11 +88,16 @@ def read_frd_headers(path: Path) -> tuple[list[int], list[FrdResult]]:
             headers = [(header.groupdict(), header.end()) for header in _HEADER.finditer(content)]
             results = [_result(header, end) for header, end in headers]
             wrong = _no_number(content, results)
+            cut_off = next((result for result in results if not result.is_whole(content)), None)
     except (OSError, ValueError) as error:
         told = " ".join(str(error).split())
         raise DatasetError(f"{path}: cannot be read as results of CalculiX: it is damaged: {told}") from error
     if wrong is not None:
         raise DatasetError(f"{path}: cannot be read as results of CalculiX: no number in the line {wrong!r}")
+    if cut_off is not None:
+        raise DatasetError(
+            f"{path}: is cut off in {cut_off.name} at the time {cut_off.time:g}: copy it whole, or solve the job again"
+        )
     imaginary = next((result.name for result in results if result.name in ("DISPI", "PDISP")), None)
     if imaginary is not None:
         raise DatasetError(

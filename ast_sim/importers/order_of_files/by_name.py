@@ -47,12 +47,26 @@ def ordered(files: list[Path], times: list[float | None]) -> tuple[list[int], li
         order = np.argsort(known, kind="stable").tolist()
         by_name = "the times inside the files, not of their names"
         return order, [] if order == as_named else [_said(files, order, by_name)]
+    unused = _unused_times(files, times)
     if len({words_of(file.stem) for file in files}) > 1:
         _require_one_series(files)
-        return as_named, [_said(files, as_named, "their names, which differ in more than a number")]
+        return as_named, [*unused, _said(files, as_named, "their names, which differ in more than a number")]
     whole = sorted(as_named, key=lambda index: _whole_numbers(files[index]))
     by_number = "the numbers in their names, read with their decimal points"
-    return as_named, _doubts(files) if whole == as_named else [_said(files, as_named, by_number)]
+    return as_named, unused + (_doubts(files) if whole == as_named else [_said(files, as_named, by_number)])
+
+
+def _unused_times(files: list[Path], times: list[float | None]) -> list[str]:
+    """A note if the times inside the files differ, but do not order them: two are equal, or a file has none."""
+    if len(set(times) - {None}) < 2:
+        return []
+    if None in times:
+        return [f"{files[times.index(None)].name} says no time, other files do: the times inside are not used"]
+    again = next((index for index, time in enumerate(times) if time in times[:index]), None)
+    if again is None:
+        return []
+    first = files[times.index(times[again])].name
+    return [f"{first} and {files[again].name} say the same time {times[again]:g}: the times inside are not used"]
 
 
 def _require_one_series(files: list[Path]) -> None:

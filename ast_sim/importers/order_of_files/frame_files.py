@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 from ast_sim.importers.formats.vtk_files import BLOCKS
 from ast_sim.importers.frames_in_file import ONE_FRAME, holds_frames
 from ast_sim.importers.order_of_files.by_name import natural_order
+from ast_sim.importers.order_of_files.left_out import left_out
 from ast_sim.importers.order_of_files.listed import SERIES, FrameFiles, in_collection, in_series
 from ast_sim.support.errors import DatasetError
-
-_LISTED = re.compile(rb"\b(?:[Ff]ile|Source)=\"([^\"]+)\"")  # in files that list the files of pieces or blocks
 
 
 def frame_files(source: Path) -> FrameFiles:
@@ -24,7 +22,7 @@ def frame_files(source: Path) -> FrameFiles:
         files = files_of_frames(source)
         if not files:
             raise DatasetError(f"{source}: the folder holds no .vtu file or other file of a frame")
-        return FrameFiles([[file] for file in sorted(files, key=natural_order)], notes=_left_out(source, files))
+        return FrameFiles([[file] for file in sorted(files, key=natural_order)], notes=left_out(source, files))
     if not source.is_file():
         raise DatasetError(f"{source}: there is no such file or folder")
     if source.suffix.lower() == ".pvd":
@@ -48,23 +46,3 @@ def files_of_frames(folder: Path) -> list[Path]:
         if files:
             return files
     return []
-
-
-def _left_out(folder: Path, files: list[Path]) -> list[str]:
-    """A note on files of frames of another kind than `files`, which are left out; pieces that these list do not
-    count."""
-    listing = [file for file in files if file.suffix.lower() in (*BLOCKS, ".pvtu", ".pvts", ".pvtp")]
-    listed = {
-        (folder / name.decode(errors="replace")).resolve()
-        for file in listing
-        for name in _LISTED.findall(file.read_bytes())
-    }
-    others = [
-        entry
-        for entry in sorted(folder.iterdir(), key=natural_order)
-        if entry.suffix.lower() in ONE_FRAME and entry not in files and entry.resolve() not in listed
-    ]
-    if not others:
-        return []
-    named = ", ".join(file.name for file in others[:3]) + (", ..." if len(others) > 3 else "")
-    return [f"{len(others)} files of another kind beside the frames are left out: {named}"]
