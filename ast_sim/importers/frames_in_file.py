@@ -134,9 +134,12 @@ def _xdmf_frames(path: Path) -> Iterator[SourceMesh]:
             f"{path}: is XDMF of the version {version}; write a series of version 3 (Xdmf3 in ParaView), .vtkhdf or"
             " .pvd"
         )
+    named = ", ".join(dict.fromkeys(one.get("Name", "without a name") for one in tree.iter("Set")))
+    sets = [f"sets are not read: {named}"] if named else []
     with _beside(path, tree, _with_grid_types(tree)) as copy:
         if not series:
-            yield _by_meshio(path, copy)
+            mesh = _by_meshio(path, copy)
+            yield replace(mesh, notes=[*mesh.notes, *sets])
             return
         _require_plain(path, series)
         _require_no_other(path, tree, series[0])
@@ -149,7 +152,8 @@ def _xdmf_frames(path: Path) -> Iterator[SourceMesh]:
                     time, point_data, cell_data = reader.read_data(step)
                     values: Any = cell_data
                     frame = meshio.Mesh(np.asarray(points), cells, point_data, values)
-                    yield replace(from_meshio(frame, path), time=float(time))
+                    mesh = from_meshio(frame, path)
+                    yield replace(mesh, time=float(time), notes=[*mesh.notes, *sets])
         except DatasetError:
             raise
         except (Exception, SystemExit) as error:
@@ -174,12 +178,18 @@ def _own_mesh(reader: Any, grid: ET.Element, shared: tuple[Any, Any]) -> tuple[A
 
 
 def _require_understood(path: Path, tree: ET.ElementTree[Any]) -> None:
-    """Raise DatasetError if nodes are not counted from 0, or a grid has a field twice: meshio reads over it."""
+    """Raise DatasetError if nodes are not counted from 0 or stand in an order of their own, numbers are not plain ones,
+    or a grid has a field twice: meshio reads over it."""
+    for item in tree.iter("DataItem"):
+        if item.get("ItemType", "Uniform") != "Uniform":
+            raise DatasetError(f"{path}: has numbers of the type {item.get('ItemType')}; must be plain ones (Uniform)")
     for topology in tree.iter("Topology"):
         if topology.get("BaseOffset", "0").strip() not in ("", "0"):
             raise DatasetError(
                 f"{path}: counts its nodes from {topology.get('BaseOffset')} (BaseOffset); must be from 0"
             )
+        if topology.get("Order"):
+            raise DatasetError(f"{path}: its cells have an Order of nodes; must be the one of XDMF, without an Order")
     for grid in tree.iter("Grid"):
         fields = [(one.get("Name"), one.get("Center", "Node")) for one in grid.findall("Attribute")]
         twice = next((name for name, center in fields if fields.count((name, center)) > 1), None)
@@ -188,10 +198,10 @@ def _require_understood(path: Path, tree: ET.ElementTree[Any]) -> None:
 
 
 def _require_no_other(path: Path, tree: ET.ElementTree[Any], series: ET.Element) -> None:
-    """Raise DatasetError if a grid stands beside a series that does not refer to it."""
+    """Raise DatasetError if a grid stands beside a series that does not refer to it, or several do."""
     beside = [grid for grid in tree.findall("Domain/Grid") if grid is not series]
     refers = any(item.tag.endswith("include") or item.get("Reference") for item in series.iter())
-    if beside and not refers:
+    if len(beside) > 1 or (beside and not refers):
         raise DatasetError(f"{path}: holds a grid beside the series of frames: write all bodies into one grid")
 
 

@@ -16,7 +16,7 @@ from ast_sim.importers.formats.together import labelled, require_one_time, toget
 from ast_sim.importers.frames_in_file import frames_in
 from ast_sim.importers.mesh_file import MeshFile, mesh_of, raw_field
 from ast_sim.importers.order_of_files.by_name import ordered
-from ast_sim.importers.order_of_files.doubts import doubts_of_times
+from ast_sim.importers.order_of_files.doubts import APART, doubts_of_times
 from ast_sim.importers.order_of_files.frame_files import frame_files
 from ast_sim.importers.scene_mesh import clamped
 from ast_sim.importers.solids.frames_match import in_order_of, order_of_cells
@@ -101,9 +101,14 @@ class _Frames:
         return tuple(known) if whole else None
 
     def doubts(self) -> list[str]:
-        """A note if the times of all frames are known and do not ascend."""
-        if self.ascending_times() is not None or None in self.times or len(self.times) < 2:
+        """A note if the times of all frames are known and do not ascend, or ascend by rounding alone."""
+        if None in self.times or len(self.times) < 2:
             return []
+        known = self.ascending_times()
+        if known is not None:
+            near = np.flatnonzero(np.diff(known) < APART * np.ptp(known))
+            named = ", ".join(str(frame) for frame in near[:3].tolist())
+            return [f"the times of frames {named} and the next differ by rounding alone: is one off?"] if named else []
         listed = ", ".join(f"{time:g}" for time in self.times[:6]) + (", ..." if len(self.times) > 6 else "")
         return [f"the times of the frames do not ascend ({listed}): the frames stand as in the file, without times"]
 

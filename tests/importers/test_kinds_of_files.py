@@ -1,5 +1,6 @@
 """Kinds of files with one frame each: read as series, or refused with what to do."""
 
+import h5py
 import meshio
 import numpy as np
 import pytest
@@ -147,3 +148,41 @@ def test_grids_of_xdmf_are_uniform_where_they_do_not_say(tmp_path):
     path.write_text(f'<Xdmf Version="2.2">{series}</Xdmf>')
     with pytest.raises(DatasetError, match="is XDMF of the version 2.2; write a series of version 3"):
         read_series(path, NAMES)
+
+
+def write_vtkhdf(path, starts):
+    """Three steps of one mesh; `starts` are the first rows of the displacements of each step."""
+    count = len(CUBE.elements)
+    with h5py.File(path, "w") as file:
+        root = file.create_group("VTKHDF")
+        root.attrs["Version"] = (2, 0)
+        root.attrs.create("Type", b"UnstructuredGrid", dtype="S16")
+        root["Points"] = CUBE.rest_position
+        for name, number in (("Points", 8), ("Cells", count), ("ConnectivityIds", 4 * count)):
+            root[f"NumberOf{name}"] = [number]
+        root["Types"] = np.full(count, 10, np.uint8)
+        root["Connectivity"] = CUBE.elements.ravel().astype(np.int64)
+        root["Offsets"] = 4 * np.arange(count + 1)
+        root["PointData/displacement"] = np.concatenate([pressed(frame) - pressed(0) for frame in range(3)])
+        steps = root.create_group("Steps")
+        steps.attrs["NSteps"] = 3
+        steps["Values"] = [0.0, 1, 2]
+        steps["NumberOfParts"] = [1, 1, 1]
+        for name in ("PartOffsets", "PointOffsets"):
+            steps[name] = [0, 0, 0]
+        for name in ("CellOffsets", "ConnectivityIdOffsets"):
+            steps[name] = [[0], [0], [0]]
+        steps["PointDataOffsets/displacement"] = starts
+
+
+def test_offsets_of_vtkhdf_that_mix_steps_are_refused(tmp_path):
+    path = tmp_path / "a.vtkhdf"
+    write_vtkhdf(path, [0, 8, 16])
+    np.testing.assert_allclose(read_series(path, NAMES).position[:, :, 2].max(axis=1), (1, 0.9, 0.8), rtol=1e-6)
+    for starts, cause in (
+        ([0, 4, 16], "two steps share a part of the rows of 'displacement'"),
+        ([0, 8, 8], "the steps use 16 of the 24 rows of 'displacement'"),
+    ):
+        write_vtkhdf(path, starts)
+        with pytest.raises(DatasetError, match=f"a.vtkhdf: .*: {cause}: its offsets are wrong"):
+            read_series(path, NAMES)

@@ -11,7 +11,7 @@ import numpy as np
 from ast_sim.importers.order_of_files.by_name import numbers_in, words_of
 from ast_sim.support.errors import DatasetError
 
-_APART = 1e-6  # of the whole time: files of one run are farther apart
+APART = 1e-6  # of the whole time: files of one run are farther apart
 _SAME = 1e-6  # of a time
 
 
@@ -25,7 +25,7 @@ def doubts_of_listed(source: Path, files: list[list[Path]], times: Sequence[floa
         twice = next((file for file in frame if frame.count(file) > 1), None)
         if twice is not None:
             raise DatasetError(f"{source}: lists {twice.name} twice for the time {time:g}")
-    near = np.flatnonzero(np.diff(times) < _APART * (times[-1] - times[0]))
+    near = np.flatnonzero(np.diff(times) < APART * (times[-1] - times[0]))
     if len(near):
         one, other = (files[near[0] + step][0].name for step in (0, 1))
         raise DatasetError(
