@@ -245,6 +245,16 @@ def test_coordinates_of_med_that_are_not_cartesian_are_refused(tmp_path):
         read_mesh(path)
 
 
+@pytest.mark.parametrize("at", [0, 2])
+def test_a_field_that_says_what_a_node_is_and_changes_is_told(tmp_path, at):
+    for frame in range(3):
+        tool = (CUBE.rest_position[:, 2] == (frame == at)).astype(float)
+        write_frame(tmp_path / f"f{frame}.vtu", CUBE.rest_position * (1, 1, 1 - 0.1 * frame), tool=tool)
+    notes = read_series(tmp_path, FieldNames(obstacle="tool")).attributes["notes"]
+    changed = "f1.vtu" if at == 0 else "f2.vtu"
+    assert notes == f"the field 'tool' changes in 8 rows of {changed}: the values of the first frame are taken"
+
+
 def test_a_displacement_in_the_plane_moves_no_body_with_a_volume(tmp_path):
     for frame in range(2):
         write_frame(tmp_path / f"f{frame}.vtu", CUBE.rest_position, displacement=np.full((8, 2), 0.1 * frame))
