@@ -21,6 +21,7 @@ from ast_sim.importers.order_of_files.frame_files import files_of_frames
 from ast_sim.importers.order_of_files.left_out import left_out
 from ast_sim.importers.order_of_files.listed import SERIES
 from ast_sim.importers.series import FieldNames, read_series
+from ast_sim.plausibility.across import AcrossSimulations
 from ast_sim.plausibility.findings import Finding, refusal, told
 from ast_sim.plausibility.motion import in_trajectory
 from ast_sim.scene import Trajectory
@@ -111,12 +112,18 @@ def convert_series(
     facts: dict[str, Any] = {"family": source.stem, "integration": integration, "length_unit": length_unit or "m"}
     facts |= {"generator": made_by, "contact_radius": contact_radius, "time_step": time_step, "stress_location": "none"}
     findings: list[tuple[str, Finding]] = []
+    across = AcrossSimulations()
     with FittedWriter(out, **facts) as writer, Progress(len(chosen), "simulations", progress) as bar:
         for split, name, trajectory in _trajectories(series, decks, chosen, names, corners, incomplete, integration):
             if not any(writer.counts.values()):
                 made_by |= _facts_of_the_first(trajectory)
                 writer.info = replace(writer.info, stress_location=trajectory.stress_at, generator=made_by)
-            findings += [(name, finding) for finding in in_trajectory(trajectory)]
+            if trajectory.stress_at != writer.info.stress_location:
+                raise DatasetError(
+                    f"{series[name]}: the place of its stress is {trajectory.stress_at!r}, in the simulations before"
+                    f" {writer.info.stress_location!r}: write it in one place in all of them, or name no stress"
+                )
+            findings += [(name, one) for one in (*in_trajectory(trajectory), *across.look(name, trajectory))]
             writer.add(split, trajectory)
             bar.advance(_line(split, name, trajectory))
         _tell(source, findings, strict)

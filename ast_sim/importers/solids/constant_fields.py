@@ -19,7 +19,7 @@ class ConstantFields:
         self.changes: dict[str, str] = {}
 
     def look(self, frame: SourceMesh, cells: np.ndarray | None) -> None:
-        """Compare a frame with the first. `cells` are its cells in the order of the first frame; None: they stand so."""
+        """Compare a frame with the first. `cells` are its cells in the order of the first frame; None: as it is."""
         for name in self.names:
             if name in frame.point_fields:
                 values = frame.point_fields[name]
