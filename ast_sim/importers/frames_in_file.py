@@ -87,8 +87,11 @@ def _by_meshio(path: Path, copy: Path | None = None) -> SourceMesh:
             mesh = meshio.read(copy or path)
     except (Exception, SystemExit) as error:
         told = _told(error, printed.getvalue()).replace(str(copy), str(path))
-        more = "" if _INSTEAD in told else f"; if it is whole, {_INSTEAD}"
-        raise DatasetError(f"{path}: cannot be read as a mesh: {told}{more}") from error
+        if "Could not deduce file format" in told:
+            told = f"files of the kind {path.suffix} are not read; {_INSTEAD}"
+        else:
+            told += f"; if it is whole, {_INSTEAD}"
+        raise DatasetError(f"{path}: cannot be read as a mesh: {told}") from error
     return from_meshio(mesh, path)
 
 
@@ -105,8 +108,6 @@ def _told(error: BaseException, printed: str = "") -> str:
     """What meshio says on a file that it cannot read, in one line."""
     from meshio import ReadError
 
-    if "Could not deduce file format" in str(error):
-        return f"files of this kind are not read; {_INSTEAD}"
     if isinstance(error, SystemExit | OSError | ReadError):
         told = " ".join(f"{printed} {error if str(error) != '1' else ''}".split())
         return told or "meshio cannot read it"

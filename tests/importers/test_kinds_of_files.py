@@ -118,7 +118,9 @@ def test_two_simulations_of_one_name_are_refused(tmp_path):
 @pytest.mark.parametrize("name", ["mesh.unv", "view.pos", "mesh.key"])
 def test_other_kinds_are_refused_with_what_to_do(tmp_path, name):
     (tmp_path / name).write_text("    -1\n")
-    with pytest.raises(DatasetError, match=f"{name}: .*files of this kind are not read; write it as .vtu, .vtk, .msh"):
+    with pytest.raises(
+        DatasetError, match=f"{name}: .*files of the kind .* are not read; write it as .vtu, .vtk, .msh"
+    ):
         read_mesh(tmp_path / name)
     with pytest.raises(DatasetError, match=f"{name}: must be a .pvd or .series file, a folder of files of frames"):
         read_series(tmp_path / name, NAMES)

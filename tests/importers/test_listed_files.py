@@ -105,6 +105,15 @@ def test_what_cannot_be_one_run_is_refused(folder, entries, cause):
         notes(pvd(folder, entries))
 
 
+@pytest.mark.parametrize("other", ['<Dataset timestep="3" {}/>', '<Group><DataSet timestep="3" {}/></Group>'])
+def test_an_entry_of_another_kind_is_not_passed_over(folder, other):
+    source = pvd(folder, A)
+    last = '<DataSet timestep="3"  file="a_3.vtu"/>'
+    source.write_text(source.read_text().replace(last, other.format('file="a_3.vtu"')))
+    with pytest.raises(DatasetError, match="all.pvd: 1 entries with a file are no DataSet right in a Collection"):
+        notes(source)
+
+
 def test_a_series_file_is_looked_at_as_well(folder):
     def series(*files):
         listed = [{"name": name, "time": time} for time, name in files]

@@ -46,6 +46,11 @@ def in_collection(source: Path) -> FrameFiles:
         raise DatasetError(f"{source}: is damaged or no PVD file: {error}") from error
     if not entries:
         raise DatasetError(f"{source}: lists no frames (no DataSet in a Collection)")
+    others = sum("file" in entry.attrib for entry in root.iter()) - len(entries)
+    if others:
+        raise DatasetError(
+            f"{source}: {others} entries with a file are no DataSet right in a Collection: write them so"
+        )
     times = [time for time, _, _ in entries]
     if len(entries) > 1 and not np.isfinite(times).all():
         raise DatasetError(f"{source}: every frame needs a timestep")
