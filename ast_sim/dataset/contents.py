@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ast_sim.dataset.reader import Dataset
+from ast_sim.plausibility.across import AcrossSimulations
 from ast_sim.plausibility.findings import Finding, told
 from ast_sim.plausibility.motion import in_trajectory
 from ast_sim.scene import NodeType
@@ -19,7 +20,9 @@ def describe_dataset(path: Path) -> dict[str, Any]:
     """Counts, sizes, fields and units of a dataset; every trajectory is read and checked."""
     findings: list[tuple[str, Finding]] = []
     with Dataset(path) as dataset:
-        splits = {split: _describe_split(dataset, split, findings) for split, count in dataset.splits.items() if count}
+        across = AcrossSimulations()
+        filled = [split for split, count in dataset.splits.items() if count]
+        splits = {split: _describe_split(dataset, split, findings, across) for split in filled}
         return {
             "kind": "dataset",
             "path": str(path),
@@ -31,7 +34,9 @@ def describe_dataset(path: Path) -> dict[str, Any]:
         }
 
 
-def _describe_split(dataset: Dataset, split: str, findings: list[tuple[str, Finding]]) -> dict[str, Any]:
+def _describe_split(
+    dataset: Dataset, split: str, findings: list[tuple[str, Finding]], across: AcrossSimulations
+) -> dict[str, Any]:
     """What a split holds; what looks wrong in it is added to the findings."""
     sizes, truncated, outside = [], [], []
     lowest = np.full(3, np.inf)
@@ -42,7 +47,8 @@ def _describe_split(dataset: Dataset, split: str, findings: list[tuple[str, Find
     for index in range(dataset.count(split)):
         trajectory = dataset.load(split, index)
         scene = trajectory.scene
-        findings += [(f"{split}/{index:06d}", finding) for finding in in_trajectory(trajectory)]
+        name = f"{split}/{index:06d}"
+        findings += [(name, one) for one in (*in_trajectory(trajectory), *across.look(name, trajectory))]
         sizes.append((scene.num_nodes, scene.num_elements, trajectory.num_frames))
         for kind in NodeType:
             types[kind.name] += int((scene.node_type == kind).sum())

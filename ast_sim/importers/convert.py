@@ -14,10 +14,14 @@ from ast_sim.dataset.layout import SPLITS
 from ast_sim.dataset.writer import FittedWriter
 from ast_sim.importers.completeness import require_complete
 from ast_sim.importers.deepmind import convert_deepmind, is_deepmind
-from ast_sim.importers.frame_order import SERIES, files_of_frames, natural_order
 from ast_sim.importers.frames_in_file import ONE_FRAME, WITH_FRAMES, holds_frames
 from ast_sim.importers.job_files import decks_of, doubt_modulus, with_units
+from ast_sim.importers.order_of_files.by_name import natural_order
+from ast_sim.importers.order_of_files.frame_files import files_of_frames
+from ast_sim.importers.order_of_files.left_out import left_out
+from ast_sim.importers.order_of_files.listed import SERIES
 from ast_sim.importers.series import FieldNames, read_series
+from ast_sim.plausibility.across import AcrossSimulations
 from ast_sim.plausibility.findings import Finding, refusal, told
 from ast_sim.plausibility.motion import in_trajectory
 from ast_sim.scene import Trajectory
@@ -109,12 +113,18 @@ def convert_series(
     facts: dict[str, Any] = {"family": source.stem, "integration": integration, "length_unit": length_unit or "m"}
     facts |= {"generator": made_by, "contact_radius": contact_radius, "time_step": time_step, "stress_location": "none"}
     findings: list[tuple[str, Finding]] = []
+    across = AcrossSimulations()
     with FittedWriter(out, **facts) as writer, Progress(len(chosen), "simulations", progress) as bar:
         for split, name, trajectory in _trajectories(series, decks, chosen, names, corners, incomplete, integration):
             if not any(writer.counts.values()):
                 made_by |= _facts_of_the_first(trajectory)
                 writer.info = replace(writer.info, stress_location=trajectory.stress_at, generator=made_by)
-            findings += [(name, finding) for finding in in_trajectory(trajectory)]
+            if trajectory.stress_at != writer.info.stress_location:
+                raise DatasetError(
+                    f"{series[name]}: the place of its stress is {trajectory.stress_at!r}, in the simulations before"
+                    f" {writer.info.stress_location!r}: write it in one place in all of them, or name no stress"
+                )
+            findings += [(name, one) for one in (*in_trajectory(trajectory), *across.look(name, trajectory))]
             writer.add(split, trajectory)
             bar.advance(_line(split, name, trajectory))
         _tell(source, findings, strict)
@@ -183,14 +193,16 @@ def find_series(source: Path) -> dict[str, Path]:
     """The simulations in a source by name, in natural order.
 
     Raises:
-        DatasetError: there is no simulation.
+        DatasetError: there is no simulation, or two have the same name.
     """
     if not source.is_dir():
         return {source.stem: source}
-    series = {
-        path.relative_to(source).with_suffix("").as_posix() if path != source else source.name: path
-        for path in _series_in(source)
-    }
+    series: dict[str, Path] = {}
+    for path in _series_in(source):
+        name = path.relative_to(source).with_suffix("").as_posix() if path != source else source.name
+        if name in series:
+            raise DatasetError(f"{path}: is the simulation {name!r}, and so is {series[name].name}: move one elsewhere")
+        series[name] = path
     if not series:
         known = ", ".join((".pvd", *WITH_FRAMES, *ONE_FRAME))
         raise DatasetError(f"{source}: neither the folder nor a folder in it holds files of results: {known}")
@@ -199,19 +211,23 @@ def find_series(source: Path) -> dict[str, Path]:
 
 def _series_in(folder: Path) -> Iterator[Path]:
     """The simulations in a folder. If it holds files with all frames or .pvd files, only these count; else .series
-    files, if there are any: both list files of frames."""
+    files, if there are any: both list files of frames. Files of Gmsh count if there is nothing else."""
     entries = sorted(folder.iterdir(), key=natural_order)
     files = [entry for entry in entries if entry.is_file() and not entry.name.startswith(".")]
     collections = [entry for entry in files if entry.suffix.lower() == ".pvd" or holds_frames(entry)]
     collections = collections or [entry for entry in files if entry.suffix.lower() == SERIES]
     if collections:
+        for note in left_out(folder, collections):
+            warn(f"{folder}: {note}")
         yield from collections
-    elif files_of_frames(folder):
+        return
+    of_frames = files_of_frames(folder)
+    meshes = all(file.suffix.lower() == ".msh" for file in of_frames)  # frames if nothing else is there
+    if of_frames and not meshes:
         yield folder
-    else:
-        for entry in entries:
-            if entry.is_dir() and not entry.name.startswith("."):
-                yield from _series_in(entry)
+        return
+    inner = [series for entry in entries if entry.is_dir() and entry.name[0] != "." for series in _series_in(entry)]
+    yield from inner or ([folder] if len(of_frames) > 1 else [])
 
 
 def _assign(

@@ -19,14 +19,16 @@ from ast_sim.importers.decks.deck_mesh import deck_mesh
 from ast_sim.importers.formats.gmsh_files import gmsh_mesh
 from ast_sim.importers.formats.source_mesh import CellBlock, SourceMesh, from_meshio
 from ast_sim.importers.formats.stl_file import BadSurface, read_stl
-from ast_sim.importers.formats.vtk_files import ENDINGS, is_dyna, vtk_frames
+from ast_sim.importers.formats.vtk_files import BLOCKS, ENDINGS, is_dyna, vtk_frames
 from ast_sim.support.errors import DatasetError
 
 # Formats whose files hold all frames of a simulation.
 WITH_FRAMES = (".vtkhdf", ".frd", ".xdmf", ".xmf", ".e", ".ex2", ".exo", ".exoii", ".exii")
 
 # Formats in which each frame is a file of its own.
-ONE_FRAME = (".vtu", ".pvtu", ".vtk", ".vtp", ".pvtp", ".vtm", ".vtmb")
+ONE_FRAME = (".vtu", ".pvtu", ".vtk", ".vtp", ".pvtp", ".vts", ".pvts", *BLOCKS, ".msh")
+
+_INSTEAD = "write it as .vtu, .vtk, .msh or .inp"
 
 
 def holds_frames(path: Path) -> bool:
@@ -84,7 +86,12 @@ def _by_meshio(path: Path, copy: Path | None = None) -> SourceMesh:
         with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
             mesh = meshio.read(copy or path)
     except (Exception, SystemExit) as error:
-        raise DatasetError(f"{path}: cannot be read as a mesh: {_told(error, printed.getvalue())}") from error
+        told = _told(error, printed.getvalue()).replace(str(copy), str(path))
+        if "Could not deduce file format" in told:
+            told = f"files of the kind {path.suffix} are not read; {_INSTEAD}"
+        else:
+            told += f"; if it is whole, {_INSTEAD}"
+        raise DatasetError(f"{path}: cannot be read as a mesh: {told}") from error
     return from_meshio(mesh, path)
 
 
@@ -122,9 +129,18 @@ def _xdmf_frames(path: Path) -> Iterator[SourceMesh]:
         raise DatasetError(f"{path}: cannot be read as a mesh: it is no XML: {error}") from error
     _require_understood(path, tree)
     series = tree.findall("Domain/Grid[@GridType='Collection']")
-    with _beside(path, tree) as copy:
+    version = str(tree.getroot().get("Version"))
+    if series and version.partition(".")[0] != "3":
+        raise DatasetError(
+            f"{path}: is XDMF of the version {version}; write a series of version 3 (Xdmf3 in ParaView), .vtkhdf or"
+            " .pvd"
+        )
+    named = ", ".join(dict.fromkeys(one.get("Name", "without a name") for one in tree.iter("Set")))
+    sets = [f"sets are not read: {named}"] if named else []
+    with _beside(path, tree, _with_grid_types(tree)) as copy:
         if not series:
-            yield _by_meshio(path, copy)
+            mesh = _by_meshio(path, copy)
+            yield replace(mesh, notes=[*mesh.notes, *sets])
             return
         _require_plain(path, series)
         _require_no_other(path, tree, series[0])
@@ -137,11 +153,20 @@ def _xdmf_frames(path: Path) -> Iterator[SourceMesh]:
                     time, point_data, cell_data = reader.read_data(step)
                     values: Any = cell_data
                     frame = meshio.Mesh(np.asarray(points), cells, point_data, values)
-                    yield replace(from_meshio(frame, path), time=float(time))
+                    mesh = from_meshio(frame, path)
+                    yield replace(mesh, time=float(time), notes=[*mesh.notes, *sets])
         except DatasetError:
             raise
         except (Exception, SystemExit) as error:
             raise DatasetError(f"{path}: cannot be read as a mesh: {_told(error)}") from error
+
+
+def _with_grid_types(tree: ET.ElementTree[Any]) -> bool:
+    """Write out that a grid is uniform where it says no type; meshio needs that. Whether there is such a grid."""
+    plain = [grid for grid in tree.iter("Grid") if grid.get("GridType") is None]
+    for grid in plain:
+        grid.set("GridType", "Uniform")
+    return bool(plain)
 
 
 def _own_mesh(reader: Any, grid: ET.Element, shared: tuple[Any, Any]) -> tuple[Any, Any]:
@@ -154,12 +179,18 @@ def _own_mesh(reader: Any, grid: ET.Element, shared: tuple[Any, Any]) -> tuple[A
 
 
 def _require_understood(path: Path, tree: ET.ElementTree[Any]) -> None:
-    """Raise DatasetError if nodes are not counted from 0, or a grid has a field twice: meshio reads over it."""
+    """Raise DatasetError if nodes are not counted from 0 or stand in an order of their own, numbers are not plain ones,
+    or a grid has a field twice: meshio reads over it."""
+    for item in tree.iter("DataItem"):
+        if item.get("ItemType", "Uniform") != "Uniform":
+            raise DatasetError(f"{path}: has numbers of the type {item.get('ItemType')}; must be plain ones (Uniform)")
     for topology in tree.iter("Topology"):
         if topology.get("BaseOffset", "0").strip() not in ("", "0"):
             raise DatasetError(
                 f"{path}: counts its nodes from {topology.get('BaseOffset')} (BaseOffset); must be from 0"
             )
+        if topology.get("Order"):
+            raise DatasetError(f"{path}: its cells have an Order of nodes; must be the one of XDMF, without an Order")
     for grid in tree.iter("Grid"):
         fields = [(one.get("Name"), one.get("Center", "Node")) for one in grid.findall("Attribute")]
         twice = next((name for name, center in fields if fields.count((name, center)) > 1), None)
@@ -168,10 +199,10 @@ def _require_understood(path: Path, tree: ET.ElementTree[Any]) -> None:
 
 
 def _require_no_other(path: Path, tree: ET.ElementTree[Any], series: ET.Element) -> None:
-    """Raise DatasetError if a grid stands beside a series that does not refer to it."""
+    """Raise DatasetError if a grid stands beside a series that does not refer to it, or several do."""
     beside = [grid for grid in tree.findall("Domain/Grid") if grid is not series]
     refers = any(item.tag.endswith("include") or item.get("Reference") for item in series.iter())
-    if beside and not refers:
+    if len(beside) > 1 or (beside and not refers):
         raise DatasetError(f"{path}: holds a grid beside the series of frames: write all bodies into one grid")
 
 
@@ -192,9 +223,9 @@ def _require_plain(path: Path, series: list[ET.Element]) -> None:
 
 
 @contextlib.contextmanager
-def _beside(path: Path, tree: ET.ElementTree[Any]) -> Iterator[Path]:
-    """An XDMF file; or a copy, if numbers stand in binary files beside it, which meshio looks for in the folder in
-    which the process runs: the copy names them in full."""
+def _beside(path: Path, tree: ET.ElementTree[Any], changed: bool) -> Iterator[Path]:
+    """An XDMF file; or a copy, if its tree was changed, or if numbers stand in binary files beside it, which meshio
+    looks for in the folder in which the process runs: the copy names them in full."""
     binary = [item for item in tree.iter("DataItem") if item.get("Format") == "Binary" and item.text]
     for item in binary:
         if item.get("Endian") == "Big" or item.get("Seek", "0") != "0" or item.get("Compression", "Raw") != "Raw":
@@ -202,7 +233,7 @@ def _beside(path: Path, tree: ET.ElementTree[Any]) -> Iterator[Path]:
                 f"{path}: its binary numbers must be plain ones of this machine, from the start of a file"
             )
         item.text = str(path.parent.resolve() / str(item.text).strip())
-    if not binary:
+    if not binary and not changed:
         yield path
         return
     with tempfile.TemporaryDirectory() as folder:

@@ -5,20 +5,24 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ast_sim.importers.formats.source_mesh import SourceMesh
-from ast_sim.importers.formats.together import labelled, together
-from ast_sim.importers.frame_order import frame_files, ordered
+from ast_sim.importers.formats.together import labelled, require_one_time, together
 from ast_sim.importers.frames_in_file import frames_in
 from ast_sim.importers.mesh_file import MeshFile, mesh_of, raw_field
+from ast_sim.importers.order_of_files.by_name import ordered
+from ast_sim.importers.order_of_files.doubts import doubts_of_times
+from ast_sim.importers.order_of_files.frame_files import frame_files
 from ast_sim.importers.scene_mesh import clamped
+from ast_sim.importers.solids.constant_fields import ConstantFields
 from ast_sim.importers.solids.frames_match import in_order_of, order_of_cells
 from ast_sim.importers.solids.kept_fields import KeptFields
+from ast_sim.importers.solids.kept_frames import KeptFrames
 from ast_sim.importers.solids.mesh_elements import require_extent
 from ast_sim.importers.solids.positions import far_origin, rest_and_position, warn_of_rounding, with_layers
 from ast_sim.importers.solids.stitching import Stitching
@@ -89,34 +93,6 @@ class FieldNames:
     def material_fields(self) -> tuple[str, ...]:
         """The cell fields that they come from."""
         return tuple(name.partition("=")[2] or name for name in self.material)
-
-
-@dataclass(eq=False)
-class _Frames:
-    """What is kept of each frame: points [n, 3] of the file, displacements [n, 3], stress of its points or cells, its
-    time."""
-
-    points: list[np.ndarray] = field(default_factory=list)
-    displacements: list[np.ndarray | None] = field(default_factory=list)
-    stresses: list[np.ndarray] = field(default_factory=list)
-    times: list[float | None] = field(default_factory=list)
-
-    def reorder(self, order: list[int]) -> None:
-        for name, values in vars(self).items():
-            setattr(self, name, [values[index] for index in order] if values else [])
-
-    def ascending_times(self) -> tuple[float, ...] | None:
-        """The times of the frames; None if they are not known or do not ascend."""
-        known = [time for time in self.times if time is not None]
-        whole = len(known) == len(self.times) > 1 and np.isfinite(known).all() and (np.diff(known) > 0).all()
-        return tuple(known) if whole else None
-
-    def doubts(self) -> list[str]:
-        """A note if the times of all frames are known and do not ascend."""
-        if self.ascending_times() is not None or None in self.times or len(self.times) < 2:
-            return []
-        listed = ", ".join(f"{time:g}" for time in self.times[:6]) + (", ..." if len(self.times) > 6 else "")
-        return [f"the times of the frames do not ascend ({listed}): the frames stand as in the file, without times"]
 
 
 def read_series(
@@ -190,14 +166,15 @@ def _attributes(source: Path, origin: np.ndarray, names: FieldNames, notes: list
 
 def _read_frames(
     source: Path, names: FieldNames, job: Job | None, corners: bool, further: KeptFields
-) -> tuple[MeshFile, _Frames, list[str], str]:
+) -> tuple[MeshFile, KeptFrames, list[str], str]:
     """The mesh of a simulation, what is kept of its frames in order of time, notes, and where the stress is."""
-    kept = _Frames()
+    kept = KeptFrames()
     first = None
     stitching = None
     used_fields = tuple(
         filter(None, (names.obstacle, names.handle, names.node_type or "node_type", names.body or "body"))
     )
+    constant = ConstantFields((*used_fields, *names.material_fields))
     place, order, notes = "none", (), []
     given = frames(source) if job is None else job_frames(job, source, _pascals(names), tuple(further.wanted.values()))
     for frame in given:
@@ -214,6 +191,7 @@ def _read_frames(
                 f"the elements of {frame.path.name} stand in another order: they are reordered as in the first"
             )
         stitching.look(frame, used_fields)
+        constant.look(frame, cells)
         kept.times.append(frame.time)
         kept.points.append(frame.points)
         kept.displacements.append(_displacement(frame, names))
@@ -227,13 +205,15 @@ def _read_frames(
                 f"{frame.path}: holds 'von_mises', which the first frame lacks: write it into each frame, or into none"
             )
     assert first is not None and stitching is not None
-    files, times, _ = frame_files(source)
+    files, times, _, said = frame_files(source)
+    notes += [*constant.notes(), *said]
     if source.is_dir():
         by_time, said = ordered([file for (file,) in files], kept.times)
         kept.reorder(by_time)
         further.reorder(by_time)
         notes += said
     elif times is not None:
+        notes += doubts_of_times(source, times, kept.times)
         kept.times = list(times)
     else:
         notes += kept.doubts()
@@ -247,7 +227,9 @@ def frames(source: Path) -> Iterator[SourceMesh]:
         if len(files) > 1:
             labels = of_frames.labels or [""] * len(files)
             pairs = zip(files, labels, strict=True)
-            yield together([labelled(next(frames_in(file)), label) for file, label in pairs])
+            parts = [labelled(next(frames_in(file)), label) for file, label in pairs]
+            require_one_time(parts)
+            yield together(parts)
         elif source.is_dir():
             yield next(frames_in(files[0]))
         else:
@@ -288,7 +270,7 @@ def _stress_place(frame: SourceMesh, names: FieldNames) -> tuple[str, tuple[str,
 
 
 def _stress(
-    mesh: MeshFile, kept: _Frames, used: np.ndarray, place: str, scene: Scene, pascals: float
+    mesh: MeshFile, kept: KeptFrames, used: np.ndarray, place: str, scene: Scene, pascals: float
 ) -> tuple[np.ndarray | None, list[str]]:
     """[S, N or E, 1] float32 in pascal, and a note if obstacles have none: it is 0 there."""
     if place == "none":
@@ -305,7 +287,9 @@ def _stress(
     return stress, [f"the stress is NaN at {lacking.sum()} rows of obstacles: it is 0 there"]
 
 
-def _rest_and_position(source: Path, mesh: MeshFile, kept: _Frames, used: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _rest_and_position(
+    source: Path, mesh: MeshFile, kept: KeptFrames, used: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """The rest positions [N, 3] and the positions [S, N, 3] of the used nodes, the last of which are not in the file:
     they lie behind shells and in the middles of edges."""
     rows = mesh.node_rows[used]

@@ -1,5 +1,6 @@
 """What looks wrong in the frames of a simulation: tools that change their shape, displacements in other units, elements
-that turn over, frames that repeat, bodies that change their places, no motion, contact that no model can see.
+that turn over, frames that repeat, bodies that change their places, displacements from the frame before, no motion,
+Poisson's ratios that cannot be one, contact that no model can see.
 
 Legend: S frames, N nodes, E elements.
 """
@@ -11,9 +12,11 @@ import math
 import numpy as np
 
 from ast_sim.element_topology import signed_volumes
+from ast_sim.material import POISSON
 from ast_sim.number_arrays import point
 from ast_sim.plausibility.body_places import change_places
 from ast_sim.plausibility.findings import Finding, places
+from ast_sim.plausibility.increments import counted_from_frame_before
 from ast_sim.plausibility.topology import at_rest
 from ast_sim.scene import Scene, Trajectory
 
@@ -38,9 +41,29 @@ _FRAMES = 5
 def in_trajectory(trajectory: Trajectory) -> list[Finding]:
     """What looks wrong in a simulation."""
     scene, position = trajectory.scene, trajectory.position
-    findings = [*at_rest(scene), *_still(scene, position), *_far(scene, position), *_soft_tools(scene, position)]
+    findings = [
+        *at_rest(scene),
+        *_poisson(trajectory),
+        *_still(scene, position),
+        *_far(scene, position),
+        *_soft_tools(scene, position),
+    ]
     findings += [*_turn_over(scene, position), *_repeats(position, trajectory.stress)]
-    return [*findings, *change_places(scene, position), *_contact(scene, position)]
+    findings += [*change_places(scene, position), *counted_from_frame_before(scene, position)]
+    return [*findings, *_contact(scene, position)]
+
+
+def _poisson(trajectory: Trajectory) -> list[Finding]:
+    scene = trajectory.scene
+    columns = str(trajectory.attributes.get("material", "")).split(", ")
+    if scene.material is None or POISSON not in columns:
+        return []
+    ratio = scene.material[:, columns.index(POISSON)]
+    rows = np.flatnonzero(scene.deforming_elements & ~((ratio > -1) & (ratio < 0.5)))
+    if not len(rows):
+        return []
+    meaning = f"it is {ratio[rows[0]]:g} and must lie between -1 and 0.5: is it the field of another quantity?"
+    return [Finding("elements whose Poisson's ratio cannot be one", len(rows), places("elements", rows), meaning)]
 
 
 def _still(scene: Scene, position: np.ndarray) -> list[Finding]:

@@ -493,7 +493,7 @@ def test_a_source_that_is_none_is_named(tmp_path):
 def test_simulations_that_do_not_fit_each_other_are_named(tmp_path):
     write_series(tmp_path / "r" / "a", starting_at_rest(block(1, 1, 1), 2), True, von_mises=np.ones((2, 8)))
     write_series(tmp_path / "r" / "b", starting_at_rest(block(1, 1, 1), 2), True)
-    with pytest.raises(DatasetError, match="has no stress, but stress_location is 'node'"):
+    with pytest.raises(DatasetError, match="r/b: the place of its stress is 'none', in the simulations before 'node'"):
         convert(tmp_path / "r", tmp_path / "d.h5", splits={"train": ["a", "b"]}, incomplete=True)
     assert os.listdir(tmp_path) == ["r"]
 

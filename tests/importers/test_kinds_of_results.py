@@ -144,6 +144,16 @@ def test_times_that_do_not_ascend_are_told(tmp_path):
     assert read.times is None and "the times of the frames do not ascend (0.5, 2.5, 2.5)" in read.attributes["notes"]
 
 
+def test_times_that_ascend_by_rounding_and_sets_are_told(tmp_path):
+    path = tmp_path / "all.xdmf"
+    write_xdmf(path, 3 * [np.arange(len(PAD.elements))])
+    text = path.read_text().replace('"1.5"', '"0.5000000001"')
+    path.write_text(text.replace("</Topology>", '</Topology><Set Name="low" SetType="Node"/>', 1))
+    notes = read_series(path, FieldNames(handle="0:zmin,zmax")).attributes["notes"]
+    assert "sets are not read: low" in notes
+    assert "the times of frames 0 and the next differ by rounding alone: is one off?" in notes
+
+
 def write_frame(path, position, **fields):
     meshio.Mesh(position, [("tetra", CUBE.elements)], fields).write(path)
 
@@ -208,6 +218,8 @@ def test_binary_numbers_of_xdmf_that_meshio_would_misread_are_refused(tmp_path, 
     [
         ("<Topology ", '<Topology BaseOffset="1" ', r"counts its nodes from 1 \(BaseOffset\)"),
         ("</Grid></Grid>", "</Grid></Grid><Grid/>", "holds a grid beside the series of frames"),
+        ("<Topology ", '<Topology Order="3 2 1 0" ', "its cells have an Order of nodes"),
+        ("<DataItem ", '<DataItem ItemType="Function" Function="2*$0" ', "has numbers of the type Function"),
         (
             '<Attribute Name="von_mises"',
             '<Attribute Name="von_mises" Center="Cell"/>' * 2 + '<Attribute Name="x"',
@@ -231,6 +243,16 @@ def test_coordinates_of_med_that_are_not_cartesian_are_refused(tmp_path):
         file["ENS_MAA/mesh"].attrs["REP"] = 1
     with pytest.raises(DatasetError, match="mesh.med: the coordinates of mesh are not along x, y and z"):
         read_mesh(path)
+
+
+@pytest.mark.parametrize("at", [0, 2])
+def test_a_field_that_says_what_a_node_is_and_changes_is_told(tmp_path, at):
+    for frame in range(3):
+        tool = (CUBE.rest_position[:, 2] == (frame == at)).astype(float)
+        write_frame(tmp_path / f"f{frame}.vtu", CUBE.rest_position * (1, 1, 1 - 0.1 * frame), tool=tool)
+    notes = read_series(tmp_path, FieldNames(obstacle="tool")).attributes["notes"]
+    changed = "f1.vtu" if at == 0 else "f2.vtu"
+    assert notes == f"the field 'tool' changes in 8 rows of {changed}: the values of the first frame are taken"
 
 
 def test_a_displacement_in_the_plane_moves_no_body_with_a_volume(tmp_path):

@@ -245,9 +245,28 @@ def declared_in_vtkhdf(path: Path) -> list[list[int]]:
         first = steps["PartOffsets"][:count] if "PartOffsets" in steps else np.arange(count)
         parts = steps["NumberOfParts"][:count] if "NumberOfParts" in steps else np.ones(count, int)
         ranges = [slice(int(start), int(start) + int(length)) for start, length in zip(first, parts, strict=True)]
-        return [[int(points[part].sum()), int(cells[part].sum())] for part in ranges]
+        of_steps = [[int(points[part].sum()), int(cells[part].sum())] for part in ranges]
+        for place, column in (("Point", 0), ("Cell", 1)):
+            for name, starts in steps.get(f"{place}DataOffsets", {}).items():
+                rows = root[f"{place}Data/{name}"].shape[0]
+                _require_each_row_once(name, rows, starts[:count], np.array(of_steps)[:, column])
+        return of_steps
 
     return _looked_at(path, counts)
+
+
+def _require_each_row_once(name: str, rows: int, starts: np.ndarray, lengths: np.ndarray) -> None:
+    """Check that each of the rows of a field is of one step, or of several steps that share all of their rows.
+
+    Raises:
+        ValueError: two steps share a part of their rows, or some rows are of no step.
+    """
+    bounds = np.unique(np.stack([starts, starts + lengths], axis=1), axis=0)
+    if (bounds[1:, 0] < bounds[:-1, 1]).any():
+        raise ValueError(f"two steps share a part of the rows of {name!r}: its offsets are wrong")
+    used = int((bounds[:, 1] - bounds[:, 0]).sum())
+    if used < rows:
+        raise ValueError(f"the steps use {used} of the {rows} rows of {name!r}: its offsets are wrong")
 
 
 def _looked_at(path: Path, look: Callable[[Any], _Found]) -> _Found:

@@ -12,6 +12,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -26,8 +27,6 @@ _HEADER = re.compile(
 )
 _NO_NUMBER = re.compile(rb"^ -[12][^\n]*[*dDqQ,;][^\n]*", re.MULTILINE)  # stars: more digits than there is room for
 _MODES = {b"2": "modes of vibration", b"4": "modes of buckling"}
-# A line of the status file beside it: step, increment, attempt (with U: not converged), iterations and the total time.
-_STATUS = re.compile(r"^\s*[0-9]+\s+[0-9]+\s+[0-9]+(?P<failed>U?)\s+[0-9]+\s+(?P<time>[-+.0-9E]+)\s", re.MULTILINE)
 
 _TEXT_WIDTHS = {0: 5, 1: 10}  # of the number of a node, by format
 _BINARY_WIDTHS = {2: 4, 3: 8}  # of a value, by format
@@ -45,15 +44,35 @@ class FrdResult:
     format: int
     start: int
 
+    def is_whole(self, content: mmap.mmap) -> bool:
+        """Whether the file goes on to the end of its numbers; a reader fills what is missing with zeros."""
+        if self.format in _TEXT_WIDTHS:
+            return content.find(b"\n -3", self.start - 1) >= 0
+        return self.start + self.count * self._row.itemsize <= len(content)
+
     def nodes(self, content: mmap.mmap) -> np.ndarray:
         """[count] the numbers of the nodes that it has values for."""
         if self.format in _TEXT_WIDTHS:
             block = content[self.start : content.find(b"\n -3", self.start - 1)]
             numbers = re.findall(rb"^ -1(.{%d})" % _TEXT_WIDTHS[self.format], block, re.MULTILINE)
             return np.array(numbers).astype(np.int64)
-        row = np.dtype([("node", "<i4"), ("values", f"<f{_BINARY_WIDTHS[self.format]}", self.columns)])
-        end = self.start + self.count * row.itemsize
-        return np.frombuffer(content[self.start : end], row)["node"].astype(np.int64)
+        return self._rows(content)["node"].astype(np.int64)
+
+    def vectors(self, content: mmap.mmap) -> np.ndarray:
+        """[count, 3] the values of a result with three columns."""
+        if self.format in _TEXT_WIDTHS:
+            block = content[self.start : content.find(b"\n -3", self.start - 1)]
+            line = rb"^ -1.{%d}(.{12})(.{12})(.{12})" % _TEXT_WIDTHS[self.format]
+            return np.array(re.findall(line, block, re.MULTILINE)).astype(np.float64).reshape(-1, 3)
+        return self._rows(content)["values"].astype(np.float64)
+
+    def _rows(self, content: mmap.mmap) -> np.ndarray:
+        """The rows of a binary result: `node` and `values`."""
+        return np.frombuffer(content[self.start : self.start + self.count * self._row.itemsize], self._row)
+
+    @property
+    def _row(self) -> np.dtype[Any]:
+        return np.dtype([("node", "<i4"), ("values", f"<f{_BINARY_WIDTHS[self.format]}", self.columns)])
 
 
 def read_frd_headers(path: Path) -> tuple[list[int], list[FrdResult]]:
@@ -64,16 +83,21 @@ def read_frd_headers(path: Path) -> tuple[list[int], list[FrdResult]]:
             time, or a line holds what is no number.
     """
     try:
-        with _opened(path) as content:
+        with opened(path) as content:
             counts = [_declared(content, key) for key in (b"2C", b"3C")]
             headers = [(header.groupdict(), header.end()) for header in _HEADER.finditer(content)]
             results = [_result(header, end) for header, end in headers]
             wrong = _no_number(content, results)
+            cut_off = next((result for result in results if not result.is_whole(content)), None)
     except (OSError, ValueError) as error:
         told = " ".join(str(error).split())
         raise DatasetError(f"{path}: cannot be read as results of CalculiX: it is damaged: {told}") from error
     if wrong is not None:
         raise DatasetError(f"{path}: cannot be read as results of CalculiX: no number in the line {wrong!r}")
+    if cut_off is not None:
+        raise DatasetError(
+            f"{path}: is cut off in {cut_off.name} at the time {cut_off.time:g}: copy it whole, or solve the job again"
+        )
     imaginary = next((result.name for result in results if result.name in ("DISPI", "PDISP")), None)
     if imaginary is not None:
         raise DatasetError(
@@ -111,35 +135,9 @@ def partly_given(path: Path, results: list[FrdResult], nodes: int) -> Iterator[t
     of the nodes that have some."""
     few = [result for result in results if result.count < nodes]
     if few:
-        with _opened(path) as content:
+        with opened(path) as content:
             for result in few:
                 yield result, result.nodes(content)
-
-
-def given_up(path: Path, results: list[FrdResult]) -> float | None:
-    """The time of the last increment, if CalculiX gave it up: then its displacements are far from an equilibrium, and
-    the "forces" are what is left over. The status file (.sta) beside the results says so; without one, an increment
-    that has displacements and forces alone, unlike the one before.
-
-    Raises:
-        DatasetError: there is no other increment.
-    """
-    names: dict[float, set[str]] = {}
-    for result in results:
-        names.setdefault(result.time, set()).add(result.name)
-    times = sorted(names)
-    status = path.with_suffix(".sta")
-    lines = list(_STATUS.finditer(status.read_text(errors="replace"))) if status.is_file() else []
-    if not times or (lines and not lines[-1]["failed"]):
-        return None
-    if lines:
-        ended = max([0.0, *(float(line["time"]) for line in lines if not line["failed"])])
-        failed = times[-1] > ended * (1 + 1e-6)
-    else:
-        failed = len(times) > 1 and names[times[-1]] == {"DISP", "FORC"} != names[times[-2]]
-    if failed and len(times) == 1:
-        raise DatasetError(f"{path}: the job did not converge: its only increment is the state in which it gave up")
-    return times[-1] if failed else None
 
 
 def _declared(content: mmap.mmap, key: bytes) -> int:
@@ -161,6 +159,7 @@ def _result(header: dict[str, bytes], end: int) -> FrdResult:
 
 
 @contextlib.contextmanager
-def _opened(path: Path) -> Iterator[mmap.mmap]:
+def opened(path: Path) -> Iterator[mmap.mmap]:
+    """The bytes of a file."""
     with path.open("rb") as file, contextlib.closing(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)) as content:
         yield content

@@ -28,6 +28,7 @@ from typing import Any
 
 import numpy as np
 
+from ast_sim.importers.formats.frd_given_up import given_up
 from ast_sim.importers.formats.frd_results import partly_given, read_frd_headers
 from ast_sim.importers.formats.vtk_data import Block, Refused, arrays_of, blocks_of, time_of
 
@@ -114,7 +115,7 @@ def _read(path: Path, step: int) -> tuple[dict[str, Any], list[dict[str, np.ndar
     if not 0 <= step < len(file.times):
         raise Refused(f"has no frame {step}; it has {len(file.times)}")
     if isinstance(file, _Results):
-        return {"steps": len(file.times), "time": file.times[step]}, [file.frame(step)]
+        return {"steps": len(file.times), "time": file.times[step], **file.facts}, [file.frame(step)]
     if file.set_step is not None:
         file.set_step(step)  # by its number: times may stand in a file twice
     file.reader.Update()
@@ -136,12 +137,13 @@ class _Opened:
 
 @dataclass
 class _Results:
-    """An .frd file of CalculiX, the times of its frames, and of each time the results that only some nodes have: their
-    names and these nodes."""
+    """An .frd file of CalculiX, the times of its frames, of each time the results that only some nodes have (their
+    names and these nodes), and whether its last increment was given up."""
 
     reader: Any
     times: list[float | None]
     partial: dict[float, list[tuple[str, np.ndarray]]]
+    facts: dict[str, Any]
 
     def frame(self, step: int) -> dict[str, np.ndarray]:
         if self.times[step] is not None:
@@ -171,7 +173,7 @@ def _opened(path: Path, changed: int, size: int) -> _Opened | _Results:
         partial: dict[float, list[tuple[str, np.ndarray]]] = {}
         for result, nodes in partly_given(path, results, declared):
             partial.setdefault(result.time, []).append((result.name, nodes))
-        return _Results(reader, [*reader.time_values] or [None], partial)
+        return _Results(reader, [*reader.time_values] or [None], partial, {"given_up": given_up(path, results)})
     if ending in _ENDINGS_OF_EXODUS:
         return _exodus(path)
     if path.name.lower().startswith("d3plot") or ending == ".d3plot":
@@ -195,8 +197,11 @@ def _xml_or_legacy(path: Path, ending: str) -> Any:
             ".vtp": "PolyData",
             ".pvtp": "PPolyData",
             ".vts": "StructuredGrid",
+            ".pvts": "PStructuredGrid",
             ".vtm": "MultiBlockData",
             ".vtmb": "MultiBlockData",
+            ".vtpc": "PartitionedDataSetCollection",
+            ".vtpd": "PartitionedDataSet",
         }[ending]
         reader = getattr(vtkIOXML, f"vtkXML{name}Reader")()
     reader.SetFileName(_name(path))

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from ast_sim.importers.formats.source_mesh import SourceMesh
+from ast_sim.support.errors import DatasetError
 
 
 def labels_of(files: Sequence[str]) -> list[str]:
@@ -31,6 +32,23 @@ def labelled(mesh: SourceMesh, label: str) -> SourceMesh:
     count = 1 if mesh.pieces is None else int(mesh.pieces.max(initial=0)) + 1
     names = mesh.piece_names or ("",) * count
     return replace(mesh, piece_names=tuple(f"{label}/{name}" if name else label for name in names))
+
+
+def require_one_time(parts: Sequence[SourceMesh]) -> None:
+    """Check that the files of the parts of a frame do not say different times.
+
+    Raises:
+        DatasetError: two do.
+    """
+    timed = [part for part in parts if part.time is not None]
+    other = next(
+        (part for part in timed if not np.isclose(part.time or 0, timed[0].time or 0, rtol=1e-6, atol=0)), None
+    )
+    if other is not None:
+        raise DatasetError(
+            f"{other.path}: is a part of a frame at the time {other.time:g}, {timed[0].path.name} at {timed[0].time:g}:"
+            " list parts of one time together"
+        )
 
 
 def together(meshes: Sequence[SourceMesh]) -> SourceMesh:

@@ -53,9 +53,16 @@ def blocks_of(data: Any, names: tuple[str, ...] = ()) -> list[Block]:
 
 
 def time_of(data: Any, blocks: Sequence[Block] = ()) -> float | None:
-    """The time that a data set says, or else the one time that its meshes say; None if they say none or several."""
-    times = [_own_time(data), *({_own_time(block.data) for block in blocks} - {None})]
-    return times[0] if times[0] is not None else times[1] if len(times) == 2 else None
+    """The time that a data set says, or else the one that its meshes say; None if they say none.
+
+    Raises:
+        Refused: they say several.
+    """
+    times = sorted({time for block in blocks if (time := _own_time(block.data)) is not None})
+    if len(times) > 1:
+        raise Refused(f"its blocks are of different times ({times[0]:g}, {times[1]:g}): write the blocks of one frame")
+    own = _own_time(data)
+    return own if own is not None or not times else times[0]
 
 
 def _own_time(data: Any) -> float | None:

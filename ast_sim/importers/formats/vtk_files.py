@@ -29,15 +29,17 @@ from ast_sim.importers.formats.declared_sizes import (
     needed_bytes,
     stored_in_hdf,
 )
-from ast_sim.importers.formats.frd_results import given_up, read_frd_headers
+from ast_sim.importers.formats.frd_given_up import is_left_out
+from ast_sim.importers.formats.frd_results import read_frd_headers
 from ast_sim.importers.formats.source_mesh import SourceMesh
 from ast_sim.importers.formats.together import labels_of, together
 from ast_sim.importers.formats.vtk_cells import blocks_of
-from ast_sim.support.errors import DatasetError, require, warn
+from ast_sim.support.errors import DatasetError, require
 
 READING_MODULE = "ast_sim.importers.formats.reading_worker"
 EXODUS = (".e", ".ex2", ".exo", ".exoii", ".exii", ".g", ".gen")
-XML = (".vtu", ".pvtu", ".vtp", ".pvtp", ".vts", ".vtm", ".vtmb")
+BLOCKS = (".vtm", ".vtmb", ".vtpc", ".vtpd")  # list the files of blocks
+XML = (".vtu", ".pvtu", ".vtp", ".pvtp", ".vts", ".pvts", *BLOCKS)
 ENDINGS = (*XML, ".vtk", ".vtkhdf", *EXODUS, ".frd")
 
 # Memory for a file: that for what it declares, for VTK's copies of it, and for what VTK needs itself.
@@ -82,20 +84,9 @@ def vtk_frames(path: Path) -> Iterator[SourceMesh]:
         declared = declared or ([sum(column) for column in zip(*pieces, strict=True)] if pieces else None)
         _require_counts(mesh, declared)
         step += 1
-        if path.suffix.lower() == ".frd" and step == steps and _is_given_up(path):
+        if step == steps and is_left_out(path, head.get("given_up", False), steps, head["time"]):
             return
         yield _without_ghosts(_with_pieces(mesh, pieces, _piece_names(path)))
-
-
-def _is_given_up(path: Path) -> bool:
-    """Whether the last increment of a job did not converge; a warning says that it is left out."""
-    time = given_up(path, read_frd_headers(path)[1])
-    if time is not None:
-        warn(
-            f"{path}: the job did not converge: the increment at the time {time:g} is the state in which CalculiX gave"
-            " up, and is left out"
-        )
-    return time is not None
 
 
 @contextlib.contextmanager
@@ -136,7 +127,7 @@ def _checked(path: Path) -> tuple[list[tuple[int, int]], int]:
     if ending in (".vtu", ".vtp", ".vts"):
         declared = declared_in_xml(path)
         return declared.pieces if ending != ".vts" else [], _OWN_BYTES + _COPIES * (needed_bytes(declared) + size)
-    if ending in (".pvtu", ".pvtp", ".vtm", ".vtmb"):
+    if ending in (".pvtu", ".pvtp", ".pvts", *BLOCKS):
         return _of_pieces(path)
     if ending == ".vtkhdf" or (ending in EXODUS and _is_hdf(path)):
         return [], _OWN_BYTES + _COPIES * stored_in_hdf(path, "VTKHDF" if ending == ".vtkhdf" else "/")
@@ -151,7 +142,7 @@ def _checked(path: Path) -> tuple[list[tuple[int, int]], int]:
 def _of_pieces(path: Path) -> tuple[list[tuple[int, int]], int]:
     """As `_checked`, of a file that lists the files of its pieces or blocks."""
     listed = declared_in_xml(path).sources
-    if path.suffix.lower() in (".vtm", ".vtmb"):
+    if path.suffix.lower() in BLOCKS:
         listed = [entry.attrib["file"] for entry in ElementTree.parse(path).iter("DataSet") if entry.get("file")]
     pieces, budget = [], _OWN_BYTES
     for name in listed:

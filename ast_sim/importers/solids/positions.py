@@ -38,6 +38,11 @@ def rest_and_position(
     back = at - moved
     if np.abs(back - back[0]).max() <= allowed:
         return back[0], at
+    if len(at) > 1 and np.abs(np.diff(at, axis=0) - moved[1:]).max() <= allowed:
+        raise DatasetError(
+            f"{source}: the displacement is counted from the frame before: the points move by it from frame to frame;"
+            " write the displacement from rest, or none"
+        )
     raise DatasetError(
         f"{source}: the displacement does not fit the points: in some frame the points, and the points minus the"
         " displacement, differ from frame 0; name the right field"

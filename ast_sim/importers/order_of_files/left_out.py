@@ -1,0 +1,43 @@
+"""Results in a folder that belong to none of the simulations that are taken from it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from ast_sim.importers.formats.vtk_files import BLOCKS
+from ast_sim.importers.frames_in_file import ONE_FRAME, holds_frames
+from ast_sim.importers.order_of_files.by_name import natural_order
+
+# Files that list other files, and how.
+_LISTING = (".pvd", ".series", ".pvtu", ".pvtp", ".pvts", *BLOCKS)
+_LISTED = re.compile(rb"\b(?:[Ff]ile|Source)\s*=\s*[\"']([^\"']+)[\"']|\"name\"\s*:\s*\"([^\"]+)\"")
+
+
+def left_out(folder: Path, taken: Iterable[Path]) -> list[str]:
+    """A note on results in a folder, or in folders in it, that are not `taken` and that no taken file lists."""
+    known = set(_with_listed(taken))
+    others = [
+        entry
+        for entry in sorted(folder.iterdir(), key=natural_order)
+        if entry.name[0] != "." and any(file.resolve() not in known for file in _results_in(entry))
+    ]
+    if not others:
+        return []
+    named = ", ".join(other.name for other in others[:3]) + (", ..." if len(others) > 3 else "")
+    return [f"{len(others)} other files or folders with results in {folder.name} are left out: {named}"]
+
+
+def _results_in(entry: Path) -> Iterator[Path]:
+    files = entry.rglob("*") if entry.is_dir() else [entry]
+    yield from (file for file in files if file.suffix.lower() in ONE_FRAME or holds_frames(file))
+
+
+def _with_listed(files: Iterable[Path]) -> Iterator[Path]:
+    """The files, and what they list, and what that lists, in full."""
+    for file in files:
+        yield file.resolve()
+        if file.suffix.lower() in _LISTING and file.is_file():
+            names = ((one or other).decode(errors="replace") for one, other in _LISTED.findall(file.read_bytes()))
+            yield from _with_listed(file.parent / name.replace("\\", "/") for name in names)

@@ -1,0 +1,43 @@
+"""Fields that say what a node or an element is: its type, its body, its material. A scene has one value for all
+frames."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from ast_sim.importers.formats.source_mesh import SourceMesh
+
+
+class ConstantFields:
+    """Fields by name that must be the same in all frames; those that a frame does not have are not looked at."""
+
+    def __init__(self, names: Iterable[str]) -> None:
+        self.names = tuple(names)
+        self.first: dict[str, np.ndarray] = {}
+        self.changes: dict[str, str] = {}
+
+    def look(self, frame: SourceMesh, cells: np.ndarray | None) -> None:
+        """Compare a frame with the first. `cells` are its cells in the order of the first frame; None: as it is."""
+        for name in self.names:
+            if name in frame.point_fields:
+                values = frame.point_fields[name]
+            elif name in frame.cell_fields:
+                values = np.concatenate(frame.cell_fields[name])
+                values = values if cells is None else values[cells]
+            else:
+                continue
+            first = self.first.setdefault(name, values)
+            if values.dtype.kind not in "iufb" or values.shape != first.shape:
+                continue
+            changed = ~np.isclose(values, first, rtol=1e-5, equal_nan=True).reshape(len(values), -1).all(axis=1)
+            if changed.any() and name not in self.changes:
+                self.changes[name] = (
+                    f"the field {name!r} changes in {changed.sum()} rows of {frame.path.name}: the values of the first"
+                    " frame are taken"
+                )
+
+    def notes(self) -> list[str]:
+        """A note on each field that changes."""
+        return list(self.changes.values())

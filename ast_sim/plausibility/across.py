@@ -1,0 +1,44 @@
+"""What looks wrong between the simulations of a dataset: one that stands in it twice, one in another unit of length."""
+
+from __future__ import annotations
+
+import hashlib
+
+import numpy as np
+
+from ast_sim.plausibility.findings import Finding
+from ast_sim.scene import Trajectory
+
+# Sizes of scenes that differ by more than this tell of two units, such as mm and m.
+_UNITS = 100.0
+
+
+class AcrossSimulations:
+    """Compares each simulation with those before."""
+
+    def __init__(self) -> None:
+        self.names: dict[bytes, str] = {}  # by a digest of the frames
+        self.first: tuple[str, float] | None = None  # the name and the size of the first scene
+
+    def look(self, name: str, trajectory: Trajectory) -> list[Finding]:
+        """What looks wrong in a simulation beside those before."""
+        return [*self._repeats(name, trajectory), *self._other_unit(name, trajectory)]
+
+    def _repeats(self, name: str, trajectory: Trajectory) -> list[Finding]:
+        content = hashlib.sha256(np.ascontiguousarray(trajectory.scene.elements).data)
+        content.update(np.ascontiguousarray(trajectory.position).data)
+        for more in (trajectory.scene.material, trajectory.stress):
+            content.update(b"" if more is None else np.ascontiguousarray(more).data)
+        other = self.names.setdefault(content.digest(), name)
+        if other == name:
+            return []
+        meaning = "errors are measured too small where one is in the training and one in the tests: leave one out"
+        return [Finding("simulations that stand in the data twice", 1, f"as {other}", meaning)]
+
+    def _other_unit(self, name: str, trajectory: Trajectory) -> list[Finding]:
+        size = float(np.ptp(trajectory.scene.rest_position, axis=0).max())
+        first, usual = self.first = self.first or (name, size)
+        if usual == 0 or size == 0 or 1 / _UNITS < size / usual < _UNITS:
+            return []
+        meaning = f"{first} has the size {usual:.3g}: are all in one unit of length?"
+        return [Finding("simulations of another size", 1, f"size {size:.3g}", meaning)]

@@ -1,0 +1,190 @@
+"""Kinds of files with one frame each: read as series, or refused with what to do."""
+
+import h5py
+import meshio
+import numpy as np
+import pytest
+import pyvista
+from blocks import block
+from vtkmodules.vtkCommonDataModel import vtkPartitionedDataSet, vtkPartitionedDataSetCollection
+from vtkmodules.vtkIOParallelXML import vtkXMLPartitionedDataSetCollectionWriter, vtkXMLPartitionedDataSetWriter
+
+from ast_sim.importers.convert import find_series
+from ast_sim.importers.mesh_file import read_mesh
+from ast_sim.importers.series import FieldNames, read_series
+from ast_sim.support.errors import DatasetError
+
+CUBE = block(1, 1, 1)
+NAMES = FieldNames(handle="0:zmin")
+
+
+def pressed(frame):
+    return CUBE.rest_position * (1, 1, 1 - 0.1 * frame)
+
+
+def grid(points):
+    return pyvista.from_meshio(meshio.Mesh(points, [("tetra", CUBE.elements)]))
+
+
+def write_partitions(path, frame):
+    one, other = grid(pressed(frame)), grid(CUBE.rest_position + (0, 0, 1.5 - 0.1 * frame))
+    if path.suffix == ".vtpd":
+        data, writer = vtkPartitionedDataSet(), vtkXMLPartitionedDataSetWriter()
+        data.SetPartition(0, one)
+        data.SetPartition(1, other)
+    else:
+        data, writer = vtkPartitionedDataSetCollection(), vtkXMLPartitionedDataSetCollectionWriter()
+        data.SetPartition(0, 0, one)
+        data.SetPartition(1, 0, other)
+    writer.SetInputData(data)
+    writer.SetFileName(str(path))
+    writer.Write()
+
+
+def write_structured(path, frame):
+    """A cube of 8 cells; a .pvts file lists the .vts file of its one piece."""
+    axis = np.arange(3.0) / 2
+    x, y, z = np.meshgrid(axis, axis, axis * (1 - 0.1 * frame), indexing="ij")
+    pyvista.StructuredGrid(x, y, z).save(path.with_suffix(".vts"))
+    if path.suffix == ".pvts":
+        points = '<PPoints><PDataArray type="Float64" NumberOfComponents="3"/></PPoints>'
+        piece = f'<Piece Extent="0 2 0 2 0 2" Source="{path.stem}.vts"/>'
+        inner = f'<PStructuredGrid WholeExtent="0 2 0 2 0 2" GhostLevel="0">{points}{piece}</PStructuredGrid>'
+        path.write_text(f'<VTKFile type="PStructuredGrid" version="0.1">{inner}</VTKFile>')
+
+
+def write_gmsh(path, frame):
+    meshio.Mesh(pressed(frame), [("tetra", CUBE.elements)]).write(path, file_format="gmsh")
+
+
+@pytest.mark.parametrize(
+    ("ending", "write", "nodes"),
+    [
+        ("vtpd", write_partitions, 16),
+        ("vtpc", write_partitions, 16),
+        ("vts", write_structured, 27),
+        ("pvts", write_structured, 27),
+        ("msh", write_gmsh, 8),
+    ],
+)
+def test_a_file_for_each_frame_is_read(tmp_path, ending, write, nodes):
+    """The folders with the pieces of .vtpd and .vtpc files are no simulations."""
+    listed = ""
+    for frame in range(3):
+        write(tmp_path / f"f_{frame}.{ending}", frame)
+        listed += f'<DataSet timestep="{frame}" file="f_{frame}.{ending}"/>'
+    assert find_series(tmp_path) == {tmp_path.name: tmp_path}
+    of_folder = read_series(tmp_path, NAMES)
+    (tmp_path / "all.pvd").write_text(f'<VTKFile type="Collection"><Collection>{listed}</Collection></VTKFile>')
+    of_list = read_series(tmp_path / "all.pvd", NAMES)
+    for read in (of_folder, of_list):
+        np.testing.assert_allclose(np.ptp(read.position[:, read.scene.body == 0, 2], axis=1), (1, 0.9, 0.8), rtol=1e-6)
+        assert read.scene.num_nodes == nodes
+    assert of_list.times == (0, 1, 2)
+    assert "left out" not in of_folder.attributes.get("notes", "")
+
+
+def test_meshes_of_gmsh_beside_simulations_are_no_frames(tmp_path):
+    for frame in range(2):
+        write_gmsh(tmp_path / f"part_{frame}.msh", 0)
+        (tmp_path / "run").mkdir(exist_ok=True)
+        grid(pressed(frame)).save(tmp_path / "run" / f"f_{frame}.vtu")
+    assert find_series(tmp_path) == {"run": tmp_path / "run"}
+
+
+def test_results_that_are_left_out_are_told(tmp_path):
+    """Beside frames in a folder, and beside a list of files; not the pieces that a list names."""
+    (tmp_path / "sub").mkdir()
+    for frame in range(3):
+        grid(pressed(frame)).save(tmp_path / f"f_{frame}.vtu")
+        grid(pressed(frame)).save(tmp_path / "sub" / f"g_{frame}.vtu")
+    grid(pressed(0)).extract_surface(algorithm="dataset_surface").save(tmp_path / "tool.vtp")
+    notes = read_series(tmp_path, NAMES).attributes["notes"]
+    assert notes == f"2 other files or folders with results in {tmp_path.name} are left out: sub, tool.vtp"
+    listed = "".join(f'<DataSet timestep="{frame}" file="sub/g_{frame}.vtu"/>' for frame in range(3))
+    (tmp_path / "g.pvd").write_text(f'<VTKFile type="Collection"><Collection>{listed}</Collection></VTKFile>')
+    with pytest.warns(UserWarning, match="4 other files or folders with results in .* are left out: f_0.vtu, f_1.vtu,"):
+        assert list(find_series(tmp_path)) == ["g"]
+
+
+def test_two_simulations_of_one_name_are_refused(tmp_path):
+    """ccx2paraview writes job.pvd beside job.frd."""
+    for name in ("job.frd", "job.pvd"):
+        (tmp_path / name).touch()
+    with pytest.raises(DatasetError, match=r"job.pvd: is the simulation 'job', and so is job.frd: move one elsewhere"):
+        find_series(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["mesh.unv", "view.pos", "mesh.key"])
+def test_other_kinds_are_refused_with_what_to_do(tmp_path, name):
+    (tmp_path / name).write_text("    -1\n")
+    with pytest.raises(
+        DatasetError, match=f"{name}: .*files of the kind .* are not read; write it as .vtu, .vtk, .msh"
+    ):
+        read_mesh(tmp_path / name)
+    with pytest.raises(DatasetError, match=f"{name}: must be a .pvd or .series file, a folder of files of frames"):
+        read_series(tmp_path / name, NAMES)
+
+
+def test_a_deck_of_nastran_as_gmsh_writes_it_is_refused_with_what_to_do(tmp_path):
+    (tmp_path / "mesh.bdf").write_text("$ Created by Gmsh\nGRID,1,0,0.,0.,0.\nENDDATA\n")
+    with pytest.raises(DatasetError, match="statement not found; if it is whole, write it as .vtu, .vtk, .msh or .inp"):
+        read_mesh(tmp_path / "mesh.bdf")
+
+
+def test_grids_of_xdmf_are_uniform_where_they_do_not_say(tmp_path):
+    def one(frame):
+        points = " ".join(map(str, pressed(frame).ravel()))
+        cells = " ".join(map(str, CUBE.elements.ravel()))
+        of_cells = f'<DataItem Dimensions="{len(CUBE.elements)} 4" Format="XML" NumberType="Int">{cells}</DataItem>'
+        of_points = f'<DataItem Dimensions="8 3" Format="XML" NumberType="Float" Precision="8">{points}</DataItem>'
+        topology = f'<Topology TopologyType="Tetrahedron" NumberOfElements="{len(CUBE.elements)}">{of_cells}</Topology>'
+        return f'<Grid><Time Value="{frame}"/>{topology}<Geometry GeometryType="XYZ">{of_points}</Geometry></Grid>'
+
+    series = "".join(map(one, range(3)))
+    series = f'<Domain><Grid GridType="Collection" CollectionType="Temporal">{series}</Grid></Domain>'
+    path = tmp_path / "all.xdmf"
+    path.write_text(f'<Xdmf Version="3.0">{series}</Xdmf>')
+    read = read_series(path, NAMES)
+    np.testing.assert_allclose(read.position[:, :, 2].max(axis=1), (1, 0.9, 0.8), rtol=1e-6)
+    path.write_text(f'<Xdmf Version="2.2">{series}</Xdmf>')
+    with pytest.raises(DatasetError, match="is XDMF of the version 2.2; write a series of version 3"):
+        read_series(path, NAMES)
+
+
+def write_vtkhdf(path, starts):
+    """Three steps of one mesh; `starts` are the first rows of the displacements of each step."""
+    count = len(CUBE.elements)
+    with h5py.File(path, "w") as file:
+        root = file.create_group("VTKHDF")
+        root.attrs["Version"] = (2, 0)
+        root.attrs.create("Type", b"UnstructuredGrid", dtype="S16")
+        root["Points"] = CUBE.rest_position
+        for name, number in (("Points", 8), ("Cells", count), ("ConnectivityIds", 4 * count)):
+            root[f"NumberOf{name}"] = [number]
+        root["Types"] = np.full(count, 10, np.uint8)
+        root["Connectivity"] = CUBE.elements.ravel().astype(np.int64)
+        root["Offsets"] = 4 * np.arange(count + 1)
+        root["PointData/displacement"] = np.concatenate([pressed(frame) - pressed(0) for frame in range(3)])
+        steps = root.create_group("Steps")
+        steps.attrs["NSteps"] = 3
+        steps["Values"] = [0.0, 1, 2]
+        steps["NumberOfParts"] = [1, 1, 1]
+        for name in ("PartOffsets", "PointOffsets"):
+            steps[name] = [0, 0, 0]
+        for name in ("CellOffsets", "ConnectivityIdOffsets"):
+            steps[name] = [[0], [0], [0]]
+        steps["PointDataOffsets/displacement"] = starts
+
+
+def test_offsets_of_vtkhdf_that_mix_steps_are_refused(tmp_path):
+    path = tmp_path / "a.vtkhdf"
+    write_vtkhdf(path, [0, 8, 16])
+    np.testing.assert_allclose(read_series(path, NAMES).position[:, :, 2].max(axis=1), (1, 0.9, 0.8), rtol=1e-6)
+    for starts, cause in (
+        ([0, 4, 16], "two steps share a part of the rows of 'displacement'"),
+        ([0, 8, 8], "the steps use 16 of the 24 rows of 'displacement'"),
+    ):
+        write_vtkhdf(path, starts)
+        with pytest.raises(DatasetError, match=f"a.vtkhdf: .*: {cause}: its offsets are wrong"):
+            read_series(path, NAMES)
