@@ -37,7 +37,7 @@ AST_INLINE int64_t bfloat16_panel_size(int64_t K) { return round_up(K, BFLOAT16_
 
 /* r(x), a float whose lower half is 0. */
 AST_INLINE vi bfloat16_of(vf x) {
-  const vi bits = (vi)x, nearest = bits + 0x7fff + ((bits >> 16) & 1), sign = (vi)((vu)bits & 0x80000000);
+  const vu bits = (vu)x, nearest = bits + 0x7fff + ((bits >> 16) & 1), sign = bits & 0x80000000;
   const vf number = vselect((bits & 0x7f800000) == 0, (vf)sign, (vf)nearest);
   return (vi)((vu)vselect(x != x, (vf)(bits | 0x400000), number) & 0xffff0000);
 }

@@ -51,6 +51,7 @@ AST_INLINE dense_layer dense_backward(const float *weight, int64_t row, int64_t 
 AST_INLINE int64_t dense_panel_width(const dense_layer *l) { return l->paired ? VW : GEMM_COLUMNS; }
 AST_INLINE int64_t dense_panels(const dense_layer *l) { return divide_up(l->N, dense_panel_width(l)); }
 #ifdef AST_BFLOAT16
+_Static_assert((int)DENSE_ROWS == (int)BFLOAT16_ROWS, "blocks of rows have one size");
 /* Fewer inputs do not fill a tile: rounding them costs more than it gains. */
 AST_INLINE bool dense_is_rounded(const dense_layer *l) { return l->K >= BFLOAT16_STEP; }
 #endif
