@@ -295,9 +295,8 @@ class Dataset:
     def _unverified(self, split: str, index: int) -> h5py.Group:
         """The group of a trajectory before its hash was compared."""
         require_type("index", index, Integral, "a whole number")
-        count = self.count(split)
-        if not 0 <= index < count:
-            raise DatasetError(f"{self.path}: there is no sample {index} in {split}, which has {count}")
+        if not 0 <= index < self.count(split):
+            raise DatasetError(f"{self.path}: there is no sample {index} in {split}, which has {self.count(split)}")
         return self._file.child(self._file.child(self._file.root, split, h5py.Group), f"{index:06d}", h5py.Group)
 
     def _framed(self, split: str, index: int) -> dict[str, h5py.Dataset]:

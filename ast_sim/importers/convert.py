@@ -116,19 +116,24 @@ def convert_series(
     across = AcrossSimulations()
     with FittedWriter(out, **facts) as writer, Progress(len(chosen), "simulations", progress) as bar:
         for split, name, trajectory in _trajectories(series, decks, chosen, names, corners, incomplete, integration):
-            if not any(writer.counts.values()):
-                made_by |= _facts_of_the_first(trajectory)
-                writer.info = replace(writer.info, stress_location=trajectory.stress_at, generator=made_by)
-            if trajectory.stress_at != writer.info.stress_location:
-                raise DatasetError(
-                    f"{series[name]}: the place of its stress is {trajectory.stress_at!r}, in the simulations before"
-                    f" {writer.info.stress_location!r}: write it in one place in all of them, or name no stress"
-                )
+            _agree(writer, made_by, series[name], trajectory)
             findings += [(name, one) for one in (*in_trajectory(trajectory), *across.look(name, trajectory))]
             writer.add(split, trajectory)
             bar.advance(_line(split, name, trajectory))
         _tell(source, findings, strict)
     return writer.counts
+
+
+def _agree(writer: FittedWriter, made_by: dict[str, Any], path: Path, trajectory: Trajectory) -> None:
+    """The first simulation says where a stress lives; raise DatasetError if another one says otherwise."""
+    if not any(writer.counts.values()):
+        made_by |= _facts_of_the_first(trajectory)
+        writer.info = replace(writer.info, stress_location=trajectory.stress_at, generator=made_by)
+    if trajectory.stress_at != writer.info.stress_location:
+        raise DatasetError(
+            f"{path}: the place of its stress is {trajectory.stress_at!r}, in the simulations before"
+            f" {writer.info.stress_location!r}: write it in one place in all of them, or name no stress"
+        )
 
 
 def _tell(source: Path, findings: list[tuple[str, Finding]], strict: bool) -> None:

@@ -88,8 +88,7 @@ def checked_recipe(
         raise ConfigError(f"patient is for the own solver; {solver} has limits of its own")
     if parts is not None:
         _source(parts := file_name(parts, "parts"))
-    if keep is not None:
-        keep = _checked_keep(keep, (frames or module.FRAMES) - 1)
+    keep = None if keep is None else _checked_keep(keep, (frames or module.FRAMES) - 1)
     parts = None if parts is None else str(Path(parts).resolve())
     spec = None if spec is None else str(Path(spec).resolve())
     return Recipe(family, seed, nodes, frames, solver, parts, spec, patient, keep, order)
