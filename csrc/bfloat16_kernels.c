@@ -1,6 +1,8 @@
 /* Attention and the kernels that are made of dense layers, with products in bfloat16: the others of the table are NULL.
  * isa_amx.c and isa_avx512_bf16.c name the set of instructions and include this file. */
 #define AST_BFLOAT16
+#include "table.h"
+
 #include "attention.c"
 #include "attention_backward.c"
 #include "linear.c"
@@ -8,13 +10,6 @@
 #include "message.c"
 #include "message_backward.c" /* after message.c, whose tiles it uses */
 #include "mlp.c"
-
-#define AST_TABLE_OF(isa)  ast_kernels_##isa
-#define AST_TABLE(isa)     AST_TABLE_OF(isa)
-#define AST_STRING_OF(isa) #isa
-#define AST_STRING(isa)    AST_STRING_OF(isa)
-
-extern const ast_kernels AST_TABLE(AST_ISA);
 
 const ast_kernels AST_TABLE(AST_ISA) = {.isa = AST_STRING(AST_ISA),
                                         .vector_bytes = AST_VECTOR_BYTES,

@@ -3,6 +3,7 @@
 #include "ast.h"
 #include "simd.h"
 #include "gemm.h"
+#include "table.h"
 
 #include "attention.c"
 #include "attention_backward.c"
@@ -25,14 +26,7 @@
 #include "sparse_conv.c"
 #include "sparse_conv_weight.c" /* after sparse_conv.c, whose constants it uses */
 
-#define AST_TABLE_OF(isa)  ast_kernels_##isa
-#define AST_TABLE(isa)     AST_TABLE_OF(isa)
-#define AST_STRING_OF(isa) #isa
-#define AST_STRING(isa)    AST_STRING_OF(isa)
-
 #define AST_ENTRY(name) .name = name,
-
-extern const ast_kernels AST_TABLE(AST_ISA);
 
 const ast_kernels AST_TABLE(AST_ISA) = {
     .isa = AST_STRING(AST_ISA), .vector_bytes = AST_VECTOR_BYTES, AST_KERNELS(AST_ENTRY)};

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 from ast_sim.support.argument_checks import require_bool, require_type
 from ast_sim.support.errors import ConfigError
-from ast_sim.support.precisions import PRECISIONS, Precision
+from ast_sim.support.precisions import Precision, require_precision
 from ast_sim.support.toml_settings import whole
 
 if TYPE_CHECKING:
@@ -73,8 +73,7 @@ class Effort:
             require_type(name, count, int, "a whole number")
             object.__setattr__(self, name, count)
         require_bool(solved=self.solved)
-        if self.precision not in PRECISIONS:
-            raise ConfigError(f"precision is {self.precision!r}: choose of {', '.join(PRECISIONS)}")
+        require_precision(self.precision)
 
     @property
     def _counts(self) -> dict[str, int]:

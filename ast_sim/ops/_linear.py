@@ -15,8 +15,8 @@ from torch import Tensor
 from ast_sim.ops import library
 from ast_sim.ops.derivatives import gradient_op
 from ast_sim.ops.library import Kernel, Op, is_at_most
-from ast_sim.support.errors import ConfigError, warn
-from ast_sim.support.precisions import PRECISIONS, Precision
+from ast_sim.support.errors import warn
+from ast_sim.support.precisions import Precision, require_precision
 
 ACTIVATIONS = ("none", "relu", "geglu")
 RELU, GEGLU = 1, 2  # as numbers
@@ -109,8 +109,7 @@ def products_in(precision: Precision) -> Iterator[None]:
     Raises:
         ConfigError: there is no such precision.
     """
-    if precision not in PRECISIONS:
-        raise ConfigError(f"precision is {precision!r}: choose of {', '.join(PRECISIONS)}")
+    require_precision(precision)
     if not _FASTER:
         if precision != "float32":
             warn("this processor is no faster in bfloat16, or its kernels were not chosen: float32 is used")
