@@ -102,7 +102,7 @@ class NewtonSteps:
         held = np.ones(scene.num_nodes, bool)
         held[elements] = False
         held |= scene.prescribed
-        self.system = LinearSystem(*self.elasticity.entry_dofs(), held)
+        self.system = LinearSystem(self.elasticity.entries(), held)
         self._number = np.full(3 * scene.num_nodes, -1)
         self._number[self.system.free] = np.arange(len(self.system.free))
         faces = scene.surface().astype(np.int64)

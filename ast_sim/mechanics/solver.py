@@ -20,6 +20,7 @@ import numpy as np
 
 from ast_sim.mechanics.contact_and_friction import Contact, ContactState
 from ast_sim.mechanics.linear_algebra.linear_system import LinearSystem
+from ast_sim.mechanics.linear_algebra.sparsity import Entries
 from ast_sim.support.errors import SimulationError
 
 
@@ -44,14 +45,14 @@ class Potential(Protocol):
         """Derivative by the positions [N,3], in newton; and the mean magnitude of the forces of an element."""
 
     def hessian(self, state: Any, project: bool = False) -> np.ndarray:
-        """Values [P] of the second derivative's entries at `entry_dofs`. Several values may belong to one place.
+        """Values [P] of the second derivative's `entries`. Several values may belong to one place.
 
         Args:
             project: make the contribution of each element positive semi-definite.
         """
 
-    def entry_dofs(self) -> tuple[np.ndarray, np.ndarray]:
-        """Rows and columns [P] of the entries (3 node + component). An entry (r, c) stands for (c, r), too."""
+    def entries(self) -> tuple[Entries, ...]:
+        """The entries of the second derivative."""
 
 
 class NotConverged(SimulationError):
@@ -119,7 +120,7 @@ class Newton:
     ) -> None:
         self.potential, self.contact, self.prescribed = potential, contact, prescribed
         self.settings = settings or SolverSettings()
-        self.system = system or LinearSystem(*potential.entry_dofs(), prescribed)
+        self.system = system or LinearSystem(potential.entries(), prescribed)
         self.iterations, self.dissipation = 0, 0.0
         self.watch: Callable[[], None] = lambda: None
         self.restart(position)

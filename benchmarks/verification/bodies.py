@@ -13,6 +13,7 @@ import numpy as np
 
 from ast_sim.mechanics.contact_and_friction import Contact, ContactSettings
 from ast_sim.mechanics.elements.elasticity import Elasticity
+from ast_sim.mechanics.linear_algebra.sparsity import Entries, entry_dofs
 from ast_sim.mechanics.solver import Newton, SolverSettings
 from ast_sim.scene import Scene
 from ast_sim.simulate.shapes import mesh
@@ -43,17 +44,15 @@ class Rollers:
 
     def __init__(self, potential, held: np.ndarray, value: np.ndarray, stiffness: float) -> None:
         self.potential, self.held, self.value, self.stiffness = potential, held, np.array(value, float), stiffness
-        rows, columns = potential.entry_dofs()
-        flat = held.ravel()
-        self._keep = ~(flat[rows] | flat[columns])
-        self._dofs = np.flatnonzero(flat)
-        self._rows, self._columns = np.append(rows, self._dofs), np.append(columns, self._dofs)
+        rows, columns = entry_dofs(potential.entries())
+        self._keep = ~(held.ravel()[rows] | held.ravel()[columns])
 
     def __getattr__(self, name: str):
         return getattr(self.potential, name)
 
-    def entry_dofs(self) -> tuple[np.ndarray, np.ndarray]:
-        return self._rows, self._columns
+    def entries(self) -> tuple[Entries, ...]:
+        nodes = np.arange(len(self.held))[None]
+        return (*self.potential.entries(), Entries(nodes, np.arange(3), np.arange(3)))
 
     def evaluate(self, position: np.ndarray) -> WrappedState:
         inner = self.potential.evaluate(self.seen(position))
@@ -66,7 +65,7 @@ class Rollers:
 
     def hessian(self, state: WrappedState, project: bool = False) -> np.ndarray:
         inner = np.where(self._keep, self.potential.hessian(state.inner, project), 0)
-        return np.append(inner, np.full(len(self._dofs), self.stiffness))
+        return np.append(inner, self.stiffness * self.held.T)
 
     def seen(self, position: np.ndarray) -> np.ndarray:
         """Positions [N,3] as the wrapped potential sees them."""

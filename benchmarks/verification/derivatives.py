@@ -11,6 +11,7 @@ from ast_sim.mechanics.contact_and_friction import Contact, ContactSettings
 from ast_sim.mechanics.elements.elasticity import Elasticity
 from ast_sim.mechanics.elements.inertia import Inertia
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean
+from ast_sim.mechanics.linear_algebra.sparsity import entry_dofs
 from ast_sim.simulate.shapes import mesh
 from benchmarks.verification.bodies import box, triangles
 from benchmarks.verification.problem import Outcome, Problem, Row, at_most
@@ -47,7 +48,7 @@ def of_potential(name: str, potential, position: np.ndarray, length: float, scal
     """An `Energy` from what the solver takes as a potential."""
 
     def hessian(x: np.ndarray) -> scipy.sparse.csr_array:
-        rows, columns = potential.entry_dofs()
+        rows, columns = entry_dofs(potential.entries())
         values = potential.hessian(potential.evaluate(x))
         upper = scipy.sparse.coo_array((values, (np.minimum(rows, columns), np.maximum(rows, columns)))).tocsr()
         upper.resize((x.size, x.size))

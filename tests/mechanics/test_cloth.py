@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ast_sim.mechanics.elements.cloth import Cloth, ClothMaterial, bending_matrix
+from ast_sim.mechanics.linear_algebra.sparsity import entry_dofs
 from ast_sim.simulate.families.sphere_simple import sheet
 from ast_sim.support.errors import SimulationError
 
@@ -23,7 +24,7 @@ def deformed(rest: np.ndarray) -> np.ndarray:
 
 
 def dense(sheet_: Cloth, position: np.ndarray, project: bool = False) -> np.ndarray:
-    values, (rows, columns) = sheet_.hessian(sheet_.evaluate(position), project), sheet_.entry_dofs()
+    values, (rows, columns) = sheet_.hessian(sheet_.evaluate(position), project), entry_dofs(sheet_.entries())
     matrix = np.zeros((position.size, position.size))
     np.add.at(matrix, (rows, columns), values)
     off = rows != columns

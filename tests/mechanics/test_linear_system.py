@@ -11,6 +11,7 @@ from ast_sim.mechanics.elements.neo_hookean import NeoHookean
 from ast_sim.mechanics.linear_algebra import compliance, factorization, linear_system
 from ast_sim.mechanics.linear_algebra.factorization import Cholmod, Pardiso
 from ast_sim.mechanics.linear_algebra.linear_system import NO_CONTACT, LinearSystem
+from ast_sim.mechanics.linear_algebra.sparsity import Entries, Sparsity, entry_dofs
 from ast_sim.simulate.shapes import mesh
 
 REST, ELEMENTS = mesh.plate((0.5, 0.3, 0.03), (5, 4, 2), np.array([[0.0, 0.0, 0.06]]))
@@ -22,12 +23,12 @@ def problem(request, monkeypatch):
     monkeypatch.setattr(linear_system, "factorization", request.param)
     monkeypatch.setattr(linear_system, "ITERATE_FROM", 0)
     elasticity, fixed = Elasticity(REST, ELEMENTS, NeoHookean(1e6, 0.4)), np.abs(REST[:, 0]) > 0.25 - 1e-9
-    rows, columns = elasticity.entry_dofs()
+    rows, columns = entry_dofs(elasticity.entries())
     values = elasticity.hessian(elasticity.evaluate(REST * [1.02, 1.0, 1.01]))
     dense = np.zeros((REST.size, REST.size))
     np.add.at(dense, (rows, columns), values)
     np.add.at(dense, (columns[rows != columns], rows[rows != columns]), values[rows != columns])
-    return LinearSystem(rows, columns, fixed), values, dense, fixed
+    return LinearSystem(elasticity.entries(), fixed), values, dense, fixed
 
 
 def contact_between(nodes: np.ndarray, size: int, seed: int) -> tuple:
@@ -129,7 +130,7 @@ def test_a_schur_complement_that_is_not_positive_definite_is_told(problem, monke
     """One node is eliminated, whose own part of the matrix is positive definite; with all others it is not."""
     monkeypatch.setattr(compliance, "condensation_pays", lambda *_: True)
     system, values, _, fixed = problem
-    rows, columns = Elasticity(REST, ELEMENTS, NeoHookean(1e6, 0.4)).entry_dofs()
+    rows, columns = entry_dofs(Elasticity(REST, ELEMENTS, NeoHookean(1e6, 0.4)).entries())
     coupled = np.where(rows // 3 == columns // 3, values, 2 * values)
     directions = scipy.sparse.csr_array((np.arange(3 * np.count_nonzero(~fixed)) >= 3)[None].astype(float))
     assert compliance.compliance_of(system, values, directions, lambda _: None) is not None
@@ -194,3 +195,28 @@ def test_the_pattern_is_analysed_again_only_when_contact_adds_to_it(problem, mon
     system.restart()
     system.solve(values, NO_CONTACT, right)
     assert news[-1]
+
+
+def test_every_value_has_its_place_in_the_upper_triangle():
+    """Elements of three nodes in any order, links of two nodes that may be the same, a free node that is alone."""
+    random, nodes = np.random.default_rng(3), 12
+    triangles = np.array([random.permutation(nodes - 1)[:3] for _ in range(9)]).T
+    links = random.integers(0, nodes - 1, (2, 7))
+    links[:, 0] = 4
+    entries = (
+        Entries(triangles, *np.triu_indices(9)),
+        Entries(links, np.array([0, 1, 2]), np.array([3, 4, 5])),
+    )
+    number = np.where(np.arange(nodes) % 4 == 3, -1, 0)
+    number[number == 0] = np.arange((number == 0).sum())
+    made = Sparsity(entries, number)
+    rows, columns = (3 * number[dofs // 3] + dofs % 3 for dofs in entry_dofs(entries))
+    inside = (rows >= 0) & (columns >= 0)
+    count = 3 * (number.max() + 1)
+    places = np.repeat(np.arange(count), np.diff(made.starts)) * count + made.columns
+    assert (np.diff(places) > 0).all()
+    assert np.isin(np.arange(count) * (count + 1), places).all()
+    expected = np.minimum(rows, columns) * count + np.maximum(rows, columns)
+    assert np.array_equal(places[made.slot[inside]], expected[inside])
+    assert (made.slot[~inside] == len(places)).all()
+    assert 0 < inside.sum() < len(inside)

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
+from ast_sim.mechanics.linear_algebra.sparsity import Entries
 from ast_sim.support.errors import SimulationError
 
 # The 45 entries (p, q), p <= q, of a triangle's symmetric 9 x 9 stiffness; p = 3 a + i for component i of node a.
@@ -161,8 +162,8 @@ class Cloth:
         self._pair_columns = tuple(self.gradients[:, i][pairs[1]] for i in (0, 1))
         self._bending = material.bending * bending_matrix(rest, triangles)
         upper = sparse.triu(self._bending).tocoo()
-        self._bending_values = np.repeat(upper.data, 3)
-        self._bending_dofs = tuple((3 * index[:, None] + np.arange(3)).ravel() for index in (upper.row, upper.col))
+        self._bending_values = np.tile(upper.data, 3)
+        self._bent_nodes = np.stack([upper.row, upper.col])
 
     @property
     def unit_force(self) -> float:
@@ -209,11 +210,9 @@ class Cloth:
         total = np.bincount(self._dofs.ravel(), forces.ravel(), minlength=3 * self.num_nodes)
         return total.reshape(-1, 3) + self._bending @ state.position, float(np.abs(forces).mean())
 
-    def entry_dofs(self) -> tuple[np.ndarray, np.ndarray]:
-        """See `Potential`."""
-        rows, columns = self._bending_dofs
-        membrane = self._dofs[_ROW].ravel(), self._dofs[_COLUMN].ravel()
-        return np.concatenate([membrane[0], rows]), np.concatenate([membrane[1], columns])
+    def entries(self) -> tuple[Entries, Entries]:
+        """See `Potential`: of the membrane, then of bending."""
+        return Entries(self._nodes, _ROW, _COLUMN), Entries(self._bent_nodes, np.arange(3), np.arange(3, 6))
 
     def hessian(self, state: ClothState, project: bool = False) -> np.ndarray:
         """See `Potential`.

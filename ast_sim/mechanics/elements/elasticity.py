@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean, cofactor, determinant, von_mises
+from ast_sim.mechanics.linear_algebra.sparsity import Entries
 from ast_sim.support.errors import SimulationError
 
 # The 78 entries (p, q), p <= q, of an element's symmetric 12 x 12 stiffness; p = 3 a + i for component i of node a.
@@ -129,9 +130,9 @@ class Elasticity:
             self._lift(entries, deformation)
         return entries.ravel()
 
-    def entry_dofs(self) -> tuple[np.ndarray, np.ndarray]:
-        """Global degrees of freedom (3 node + component) of the rows and columns of `hessian`, [78 E] each."""
-        return self._dofs[_ROW].ravel(), self._dofs[_COLUMN].ravel()
+    def entries(self) -> tuple[Entries]:
+        """Of `hessian`."""
+        return (Entries(self._nodes, _ROW, _COLUMN),)
 
     def _lift(self, entries: np.ndarray, deformation: Deformation) -> None:
         """Add to the entries [78,E] of each element what makes the negative eigenvalues of d2 psi / dF2 zero."""

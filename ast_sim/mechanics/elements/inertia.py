@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ast_sim.mechanics.linear_algebra.sparsity import Entries
 from ast_sim.mechanics.solver import Potential
 
 
@@ -55,13 +56,12 @@ class Inertia:
 
     def hessian(self, state: InertialState, project: bool = False) -> np.ndarray:
         """See `Potential`."""
-        return np.concatenate([self.potential.hessian(state.inner, project), np.repeat(self.weight, 3)])
+        return np.concatenate([self.potential.hessian(state.inner, project), np.tile(self.weight, 3)])
 
-    def entry_dofs(self) -> tuple[np.ndarray, np.ndarray]:
+    def entries(self) -> tuple[Entries, ...]:
         """See `Potential`."""
-        rows, columns = self.potential.entry_dofs()
-        diagonal = np.arange(3 * len(self.weight))
-        return np.concatenate([rows, diagonal]), np.concatenate([columns, diagonal])
+        nodes = np.arange(len(self.weight))[None]
+        return (*self.potential.entries(), Entries(nodes, np.arange(3), np.arange(3)))
 
     @property
     def unit_force(self) -> float:

@@ -22,6 +22,7 @@ import numpy as np
 from ast_sim.element_topology import MIDDLES
 from ast_sim.mechanics.elements.elasticity import Deformation, Elasticity, negative_directions
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean, cofactor, determinant, von_mises
+from ast_sim.mechanics.linear_algebra.sparsity import Entries
 from ast_sim.support.errors import SimulationError
 
 LARGEST = 20.0
@@ -149,7 +150,7 @@ class SecondOrder(Elasticity):
         return self._summed(at_points).reshape(30, -1)
 
     def hessian(self, deformation: Deformation, project: bool = False) -> np.ndarray:
-        """Second derivative of each element's energy as its 465 upper entries [465 E], element by element.
+        """Second derivative of each element's energy as its 465 upper entries [465 E], entry by entry.
 
         With g_a = F^-T grad N_a, the pressure p of the mean, P = mu F + c F^-T at each point, and
         b_a = sum_p w_p J g_a, the block of nodes a, b is
@@ -184,11 +185,11 @@ class SecondOrder(Elasticity):
             entries[chunk] = blocks[:, _ROW, _COLUMN]
         if project:
             self._lift(entries, negative_directions(deformation, material.mu, c, spread, self.gradients))
-        return entries.ravel()
+        return entries.T.ravel()
 
-    def entry_dofs(self) -> tuple[np.ndarray, np.ndarray]:
-        """Global degrees of freedom (3 node + component) of the rows and columns of `hessian`, [465 E] each."""
-        return self._dofs[_ROW].T.ravel(), self._dofs[_COLUMN].T.ravel()
+    def entries(self) -> tuple[Entries]:
+        """Of `hessian`."""
+        return (Entries(self._nodes, _ROW, _COLUMN),)
 
     def _lift(self, entries: np.ndarray, negative: Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> None:
         """Add to the entries [E,465] of each element what makes the negative eigenvalues at its points zero."""

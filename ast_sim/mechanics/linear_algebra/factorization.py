@@ -16,6 +16,11 @@ import scipy.sparse
 
 from ast_sim.support.errors import SimulationError, interrupted
 
+# How PARDISO orders the unknowns. Nested dissection leaves fewer entries in the factor of a large compact body, minimum
+# degree takes two thirds of the time to find (docs/log.md, 2026-11-29).
+MINIMUM_DEGREE, DISSECTION = 0, 3
+DISSECT_FROM = 5_000  # unknowns
+
 
 class Factorization(Protocol):
     """Cholesky factorization K = L L^T of symmetric matrices that are given by their upper triangles."""
@@ -98,9 +103,11 @@ class Pardiso:
         self._solver = self._pypardiso.PyPardisoSolver(mtype=2)  # real, symmetric, positive definite
         # MKL keeps the factor until it is told.
         self._free = weakref.finalize(self, self._solver.free_memory, everything=True)
+        is_small = not len(kept) and upper.shape[0] < DISSECT_FROM
+        for parameter, value in ((1, 1), (2, MINIMUM_DEGREE if is_small else DISSECTION), (34, 1)):
+            self._solver.set_iparm(parameter, value)
         if len(kept):
-            # What PARDISO sets by itself, and two levels, and a Schur complement.
-            for parameter, value in ((1, 1), (2, 3), (34, 1), (24, 1), (36, 2)):
+            for parameter, value in ((24, 1), (36, 2)):  # two levels, and a Schur complement
                 self._solver.set_iparm(parameter, value)
             self._solver.perm = np.zeros(upper.shape[0], np.int32)
             self._solver.perm[kept] = 1

@@ -12,13 +12,14 @@ factorization is used again.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import scipy.sparse
 
-from ast_sim.element_topology import distinct
 from ast_sim.mechanics.linear_algebra.factorization import Factorization, factorization
+from ast_sim.mechanics.linear_algebra.sparsity import Entries, Sparsity, entry_dofs
 
 ITERATE_FROM = 50_000  # systems with at least this many unknowns keep a factor and iterate with it
 RELATIVE_RESIDUAL = 1e-3  # of conjugate gradients, to the right side; a Newton step reduces the error by as much
@@ -63,22 +64,22 @@ class LinearSystem:
     """Symmetric system for the free degrees of freedom; a dof is 3 node + component.
 
     Args:
-        rows, columns: [P] dofs of the entries that elements add. An entry (r, c) stands for (c, r), too. If two nodes
-            have any entries, they have one of their first components.
+        entries: that elements add, with P values in all.
         prescribed: [N] nodes whose rows and columns are left out.
 
     Attributes:
         free: [F] the dofs that are not left out.
     """
 
-    def __init__(self, rows: np.ndarray, columns: np.ndarray, prescribed: np.ndarray) -> None:
+    def __init__(self, entries: Sequence[Entries], prescribed: np.ndarray) -> None:
         free = np.repeat(~prescribed, 3)
         self.free = np.flatnonzero(free)
         self._count = len(self.free)
         self._number = np.where(free, np.cumsum(free) - 1, -1).astype(np.int32)
-        self._own, self._slot = self._pattern_of_elements(rows, columns)
-        mixed = np.flatnonzero(free[rows] != free[columns])
-        self._mixed = mixed, rows[mixed], columns[mixed]
+        self._entries, self._is_free = entries, free
+        sparsity = Sparsity(entries, np.where(prescribed, -1, np.cumsum(~prescribed) - 1))
+        rows = np.repeat(np.arange(self._count), np.diff(sparsity.starts))
+        self._own, self._slot = rows * self._count + sparsity.columns, sparsity.slot
         self._factorization = factorization()
         self.factorizations, self._has_factor = 0, False
         self._set_pattern(self._own)
@@ -93,39 +94,6 @@ class LinearSystem:
         self._has_factor = False
         if self._pattern is not self._own:
             self._set_pattern(self._own)
-
-    def _pattern_of_elements(self, rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The places of the elements' entries and of the diagonal in the upper triangle, ascending, as row * count +
-        column; and for each entry [P] the number of its place, one past the end for entries that are left out.
-
-        Two nodes fill a block of 3 x 3 places. So only the blocks are sorted, an eighth of the entries, and the blocks
-        in the rows of a node are counted; then the place of an entry follows from its components.
-        """
-        entries, nodes = rows.size, self._count // 3
-        rows, columns = self._number[rows], self._number[columns]
-        inside = np.flatnonzero((rows >= 0) & (columns >= 0))
-        pair = rows[inside], columns[inside]
-        rows = np.minimum(*pair)
-        columns = np.maximum(*pair)
-        node, other = rows // 3, columns // 3
-        component, across = rows - 3 * node, columns - 3 * other
-        one = (component == 0) & (across == 0)
-        blocks = distinct(np.append(node[one] * np.int64(nodes) + other[one], np.arange(nodes) * (nodes + 1)))
-        of_block = np.divmod(blocks, nodes)
-        first = np.searchsorted(of_block[0], np.arange(nodes + 1))
-        numbers = scipy.sparse.csr_array((np.arange(len(blocks)), of_block[1], first), shape=(nodes, nodes))
-        width = 3 * np.diff(first)  # of each of the three rows of a node
-        place = 6 * first[node] + 3 * numbers[node, other] + width[node] * component + across
-        diagonal = np.add.outer(9 * first[:-1], np.arange(3)) + np.outer(width, np.arange(3))
-        used = np.zeros(9 * len(blocks), bool)
-        used[place] = used[diagonal] = True
-        slot_of = np.cumsum(used) - 1
-        own = np.empty(slot_of[-1] + 1 if len(used) else 0, np.int64)
-        own[slot_of[diagonal.ravel()]] = np.arange(self._count) * (self._count + 1)
-        own[slot_of[place]] = rows * np.int64(self._count) + columns
-        slot = np.full(entries, len(own), np.int32)
-        slot[inside] = slot_of[place]
-        return own, slot
 
     def _keys(self, rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Which entries lie between free dofs, and the places row * count + column of these in the upper triangle."""
@@ -210,6 +178,13 @@ class LinearSystem:
         if len(keys):
             data += np.bincount(place, contact_values[upper][inside], minlength=len(data))
         return scipy.sparse.csr_array((data, self._columns, self._starts), shape=(self._count, self._count))
+
+    @functools.cached_property
+    def _mixed(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The entries between a free and a prescribed dof: their numbers, rows and columns."""
+        rows, columns = entry_dofs(self._entries)
+        mixed = np.flatnonzero(self._is_free[rows] != self._is_free[columns])
+        return mixed, rows[mixed], columns[mixed]
 
     def coupling(
         self, values: np.ndarray, contact: tuple[np.ndarray, np.ndarray, np.ndarray], increment: np.ndarray
