@@ -94,7 +94,7 @@ def surface_triangles(position: np.ndarray, elements: np.ndarray) -> np.ndarray:
     """[F, 3] int32: the triangles of the surface of the elements [E, k], as `Scene.surface` describes them."""
     if elements.shape[1] == 3:
         return elements
-    return triangles_of_faces(position, elements, _outer_faces(elements, len(position)))
+    return triangles_of_faces(elements, _outer_faces(elements, len(position)), signed_volumes(position, elements))
 
 
 def _outer_faces(elements: np.ndarray, num_nodes: int) -> np.ndarray:
@@ -114,10 +114,11 @@ def _outer_faces(elements: np.ndarray, num_nodes: int) -> np.ndarray:
     return np.flatnonzero(alone)
 
 
-def triangles_of_faces(position: np.ndarray, elements: np.ndarray, outer: np.ndarray) -> np.ndarray:
-    """[F, 3] int32: the triangles of faces by number, 4 e + face; seen from outside they run counter-clockwise."""
+def triangles_of_faces(elements: np.ndarray, outer: np.ndarray, volumes: np.ndarray) -> np.ndarray:
+    """[F, 3] int32: the triangles of faces by number, 4 e + face; seen from outside they run counter-clockwise. The
+    signed volumes [E] tell which elements are inside out."""
     owner = elements[outer // 4]
-    turned = signed_volumes(position, owner) < 0
+    turned = volumes[outer // 4] < 0
     local = np.array(FACE_TRIANGLES[elements.shape[1]])[outer % 4]  # [F, 1 or 4, 3]
     triangles = owner[np.arange(len(owner))[:, None, None], local]
     surface = np.where(turned[:, None, None], triangles[:, :, ::-1], triangles).reshape(-1, 3).astype(np.int32)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ast_sim.element_topology import LOCAL_EDGES, surface_triangles, unique_edges
+from ast_sim.element_topology import LOCAL_EDGES, signed_volumes, surface_triangles, unique_edges
 from ast_sim.mesh_arrays import NodeType, arrays_of_mesh, joined_arrays, mesh_of_arrays, require_mesh, scene_arrays
 from ast_sim.named_field import NamedField
 from ast_sim.number_arrays import ascending, ranges, require_array, require_finite, require_nodes, require_numbering
@@ -196,6 +196,11 @@ class Scene:
     @cached_property
     def _edges(self) -> np.ndarray:
         return unique_edges(self.elements, self.num_nodes)
+
+    @cached_property
+    def rest_volumes(self) -> np.ndarray:
+        """[E] float64: the volumes between the corners of the tetrahedra at rest, negative if they are inside out."""
+        return signed_volumes(self.rest_position, self.elements)
 
     def surface(self) -> np.ndarray:
         """[F, 3] int32: the triangles of the surface.

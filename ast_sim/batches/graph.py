@@ -201,7 +201,7 @@ def _surface_of(scene: Scene, elements: Tensor) -> dict[str, Tensor]:
         triangles = elements
     else:
         outer = outer_faces(elements, scene.num_nodes).numpy()
-        oriented = triangles_of_faces(scene.rest_position, scene.elements, outer)
+        oriented = triangles_of_faces(scene.elements, outer, scene.rest_volumes)
         triangles = torch.from_numpy(oriented.astype("int64"))
     return {"surface": triangles, "surface_offsets": torch.tensor([0, len(triangles)])}
 

@@ -13,7 +13,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ast_sim.element_topology import signed_volumes
 from ast_sim.material import ELASTIC, Material
 from ast_sim.mechanics.elements.second_order import LARGEST, SLOPES
 from ast_sim.ops import TetrahedronSet, elastic_forces, join_indices
@@ -66,7 +65,7 @@ class ElasticTetrahedra:
         young = young * scene.deforming_elements
         lame = np.stack([young * poisson / ((1 + poisson) * (1 - 2 * poisson)), young / (2 * (1 + poisson))], axis=1)
         lame = torch.from_numpy(lame)
-        volume = np.abs(signed_volumes(scene.rest_position, scene.elements))
+        volume = np.abs(scene.rest_volumes)
         if corners == 10:
             volume = volume / 8  # of an eighth, whose edges are as long as nodes are apart
         share = torch.from_numpy(np.repeat((young * volume ** (2 / 3)).astype(np.float32), corners))

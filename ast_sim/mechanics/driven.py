@@ -52,9 +52,9 @@ class Driven:
     @staticmethod
     def of(scene: Scene, prescribed_position: np.ndarray) -> Driven:
         """Of a scene with positions [S,N,3] of the prescribed nodes in each frame; other rows are not read."""
-        travel = np.where(
-            scene.prescribed, np.abs(prescribed_position - prescribed_position[0]).max(axis=0).max(axis=1), 0
-        )
+        given = prescribed_position[:, scene.prescribed]
+        travel = np.zeros(scene.num_nodes, given.dtype)
+        travel[scene.prescribed] = np.abs(given - given[0]).max(axis=(0, 2))
         farthest = int(np.argmax(travel))
         body = int(scene.body[farthest])
         own, moves = scene.prescribed & (scene.body == body), travel > RIGID * travel[farthest]

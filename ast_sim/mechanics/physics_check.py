@@ -162,11 +162,10 @@ def check_physics(
 
 def turned_over(scene: Scene, position: np.ndarray) -> float:
     """How many deforming tetrahedra have another sign at positions [N, 3] than at rest; 0 in a scene of triangles."""
-    elements = scene.elements[~scene.rigid_elements]
-    if elements.shape[1] == 3:
+    if scene.elements.shape[1] == 3:
         return 0.0
-    sign = np.sign(signed_volumes(scene.rest_position, elements))
-    return float((sign * signed_volumes(position, elements) <= 0).sum())
+    over = np.sign(scene.rest_volumes) * signed_volumes(position, scene.elements) <= 0
+    return float((over & ~scene.rigid_elements).sum())
 
 
 def _overlap(scene: Scene, position: np.ndarray) -> tuple[float, float]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 from ast_sim.dataset.layout import GIVEN_FRAMES, DatasetInfo
@@ -82,7 +83,7 @@ class DataFacts:
         """The number of columns of all outputs at each "node" or "element"; the motion does not count."""
         return sum(output.columns for output in self.outputs if output.location == location)
 
-    @property
+    @cached_property
     def material(self) -> Material:
         """The material of the scenes: its columns, and what the solver recorded."""
         elastic = {"young": self.young, "poisson": self.poisson} if self.young else {}

@@ -109,7 +109,7 @@ def _soft_tools(scene: Scene, position: np.ndarray) -> list[Finding]:
 def _turn_over(scene: Scene, position: np.ndarray) -> list[Finding]:
     if scene.elements.shape[1] == 3:
         return []
-    sign = np.sign(signed_volumes(scene.rest_position, scene.elements))
+    sign = np.sign(scene.rest_volumes)
     count, first, frames = 0, None, []
     for number, frame in enumerate(position):
         wrong = (signed_volumes(frame, scene.elements) * sign <= 0) & scene.deforming_elements & (sign != 0)

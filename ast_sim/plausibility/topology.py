@@ -30,7 +30,7 @@ def turned_over(scene: Scene) -> np.ndarray | None:
     """[E, 4]: the elements; if inside out, with their last two nodes exchanged. None if none is inside out."""
     if scene.elements.shape[1] != 4:
         return None
-    wrong = signed_volumes(scene.rest_position, scene.elements) < 0
+    wrong = scene.rest_volumes < 0
     if not wrong.any():
         return None
     elements = scene.elements.copy()
@@ -77,7 +77,7 @@ def _inside_out(scene: Scene) -> list[Finding]:
 def _folds(scene: Scene) -> list[Finding]:
     """Faces of more than two elements, and faces whose two elements lie on the same side of them."""
     faces = scene.elements[:, np.array(LOCAL_FACES)].reshape(-1, 3).astype(np.int64)
-    negative = np.repeat(signed_volumes(scene.rest_position, scene.elements) < 0, 4)
+    negative = np.repeat(scene.rest_volumes < 0, 4)
     # A face runs one way round or the other, seen from its lowest node; two elements beside each other see it both
     # ways.
     turned = np.take_along_axis(faces, (np.argmin(faces, axis=1)[:, None] + np.arange(3)) % 3, axis=1)

@@ -6,7 +6,14 @@ import torch
 from checks import assert_same_everywhere
 from meshes import box
 
-from ast_sim.element_topology import LOCAL_EDGES, LOCAL_FACES, surface_triangles, triangles_of_faces, unique_edges
+from ast_sim.element_topology import (
+    LOCAL_EDGES,
+    LOCAL_FACES,
+    signed_volumes,
+    surface_triangles,
+    triangles_of_faces,
+    unique_edges,
+)
 from ast_sim.ops import counting_sort, mesh_edges, outer_faces
 from ast_sim.ops._edges import _counting_sort, _mesh_edges, _outer_faces
 
@@ -44,7 +51,8 @@ def test_a_mesh_has_the_edges_and_faces_that_numpy_finds(cells):
     once = edges.receivers < edges.senders
     pairs = torch.stack([edges.receivers, edges.senders], dim=1)[once]
     assert np.array_equal(pairs.numpy(), unique_edges(elements.numpy().astype(np.int32), len(nodes)))
-    triangles = triangles_of_faces(nodes, elements.numpy(), outer_faces(elements, len(nodes)).numpy())
+    volumes = signed_volumes(nodes, elements.numpy())
+    triangles = triangles_of_faces(elements.numpy(), outer_faces(elements, len(nodes)).numpy(), volumes)
     assert np.array_equal(triangles, surface_triangles(nodes, elements.numpy()))
 
 
