@@ -259,76 +259,34 @@ KERNEL(sparse_conv_weight, x, dout, pair_offsets, source, destination, dweight) 
 
 /* ---- attention ---- */
 
-#define ATTENTION q_offsets, k_offsets, scale, dropout_p, seed, out, maximum, total
-PARAMETERS(attention_rest, ATTENTION, dout);
-
-/* Queries, keys and values, which may lie beside each other in one array, or their gradients. */
-typedef struct {
-  argument q, k, v;
-} attention_tokens;
-
-static argument attention_part(const argument *a, int64_t i, const int64_t *n) {
-  argument x = *a;
-  x.data = (float *)a->data + i * n['H'] * n['D'];
-  return x;
-}
-
-static attention_tokens attention_of_kv(const argument *q, const argument *key_value, const int64_t *n) {
-  return (attention_tokens){*q, attention_part(key_value, 0, n), attention_part(key_value, 1, n)};
-}
-
-static attention_tokens attention_of_qkv(const argument *qkv, const int64_t *n) {
-  return (attention_tokens){*qkv, attention_part(qkv, 1, n), attention_part(qkv, 2, n)};
-}
+#define ATTENTION q, k, v, q_offsets, k_offsets, scale, dropout_p, seed, out, maximum, total
+PARAMETERS(attention_tokens, ATTENTION);
 
 static bool attention_check(const call *c) {
   const int64_t D = c->size['D'];
   return (D % 16 == 0 && D >= 16 && D <= 128) || call_fail(c, "the head dimension must be a multiple of 16 up to 128");
 }
 
-static ast_attention attention_of(const attention_tokens *x, const attention_rest_arguments *a, const int64_t *n) {
+static ast_attention attention_of(const void *arguments, const int64_t *n) {
+  const attention_tokens_arguments *a = arguments;
   return (ast_attention){LIST_OF(SIZE, B, H, D),           LIST_OF(FIELD, q_offsets, k_offsets),
-                         .q_stride = x->q.row_stride,      .k_stride = x->k.row_stride,
-                         .v_stride = x->v.row_stride,      .scale = (float)a->scale.number,
+                         .q_stride = a->q.row_stride,      .k_stride = a->k.row_stride,
+                         .v_stride = a->v.row_stride,      .scale = (float)a->scale.number,
                          .dropout_p = a->dropout_p.number, .seed = (uint64_t)a->seed.integer};
 }
 
-static ast_status attention_call(attention_tokens x, const void *rest, const int64_t *n) {
-  const attention_rest_arguments *a = rest;
-  const ast_attention s = attention_of(&x, a, n);
-  return chosen_kernels()->attention(&s, x.q.data, x.k.data, x.v.data, a->out.data, a->maximum.data, a->total.data);
+KERNEL(attention, ATTENTION) {
+  const ast_attention s = attention_of(a, n);
+  return chosen_kernels()->attention(&s, a->q.data, a->k.data, a->v.data, a->out.data, a->maximum.data, a->total.data);
 }
 
-static ast_status attention_call_backward(attention_tokens x, const void *rest, attention_tokens d, const int64_t *n) {
-  const attention_rest_arguments *a = rest;
-  ast_attention s = attention_of(&x, a, n);
-  s.dq_stride = d.q.row_stride;
-  s.dk_stride = d.k.row_stride;
-  s.dv_stride = d.v.row_stride;
-  return chosen_kernels()->attention_backward(&s, x.q.data, x.k.data, x.v.data, a->out.data, a->maximum.data,
-                                              a->total.data, a->dout.data, d.q.data, d.k.data, d.v.data);
-}
-
-KERNEL(attention, q, k, v, ATTENTION) { return attention_call((attention_tokens){a->q, a->k, a->v}, &a->q_offsets, n); }
-
-KERNEL(attention_kv, q, key_value, ATTENTION) {
-  return attention_call(attention_of_kv(&a->q, &a->key_value, n), &a->q_offsets, n);
-}
-
-KERNEL(attention_qkv, qkv, ATTENTION) { return attention_call(attention_of_qkv(&a->qkv, n), &a->q_offsets, n); }
-
-KERNEL(attention_backward, q, k, v, ATTENTION, dout, dq, dk, dv) {
-  return attention_call_backward((attention_tokens){a->q, a->k, a->v}, &a->q_offsets,
-                                 (attention_tokens){a->dq, a->dk, a->dv}, n);
-}
-
-KERNEL(attention_kv_backward, q, key_value, ATTENTION, dout, dq, dkey_value) {
-  return attention_call_backward(attention_of_kv(&a->q, &a->key_value, n), &a->q_offsets,
-                                 attention_of_kv(&a->dq, &a->dkey_value, n), n);
-}
-
-KERNEL(attention_qkv_backward, qkv, ATTENTION, dout, dqkv) {
-  return attention_call_backward(attention_of_qkv(&a->qkv, n), &a->q_offsets, attention_of_qkv(&a->dqkv, n), n);
+KERNEL(attention_backward, ATTENTION, dout, dq, dk, dv) {
+  ast_attention s = attention_of(a, n);
+  s.dq_stride = a->dq.row_stride;
+  s.dk_stride = a->dk.row_stride;
+  s.dv_stride = a->dv.row_stride;
+  return chosen_kernels()->attention_backward(&s, a->q.data, a->k.data, a->v.data, a->out.data, a->maximum.data,
+                                              a->total.data, a->dout.data, a->dq.data, a->dk.data, a->dv.data);
 }
 
 /* ---- message passing ---- */
@@ -473,10 +431,6 @@ static binding bindings[] = {
     BINDING(attention_backward, .check = attention_check),
     BINDING(attention_block, .check = attention_block_check),
     BINDING(attention_block_backward, .check = attention_block_backward_check),
-    BINDING(attention_kv, .check = attention_check),
-    BINDING(attention_kv_backward, .check = attention_check),
-    BINDING(attention_qkv, .check = attention_check),
-    BINDING(attention_qkv_backward, .check = attention_check),
     BINDING(breadth_first),
     BINDING(counting_sort),
     BINDING(mesh_edges, COUNTED(mesh_edges)),

@@ -1,6 +1,6 @@
 """The ops of ast_sim: torch custom ops over the C core, each beside its torch composition."""
 
-from ast_sim.ops._attention import attention, attention_block, cross_attention, rotated, self_attention
+from ast_sim.ops._attention import attention, attention_block, rotated
 from ast_sim.ops._body_distance import WIDTH as PROXIMITY_WIDTH
 from ast_sim.ops._body_distance import proximity
 from ast_sim.ops._edges import (
@@ -32,7 +32,6 @@ __all__ = [
     "attention_block",
     "breadth_first",
     "counting_sort",
-    "cross_attention",
     "elastic_forces",
     "farthest_point_sample",
     "join_indices",
@@ -51,7 +50,6 @@ __all__ = [
     "segment_mean",
     "segment_spread",
     "segment_sum",
-    "self_attention",
     "sparse_conv",
     "sparse_conv_transposed",
 ]

@@ -7,8 +7,7 @@ to K vectors of width C, I = H D, and the feed-forward part has F hidden units.
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 
 import torch
 import torch.nn.functional as F
@@ -122,25 +121,10 @@ _SETTINGS = "q_offsets[B+1] offsets(Q), k_offsets[B+1] offsets(K), scale number,
 _OUTPUTS = "out[Q,H,D], maximum[Q,H], total[Q,H]"
 
 
-def _ops(name: str, tensors: str, split: Callable, rename: Callable[[str], str] = str) -> tuple[Op, Op]:
-    """Attention and its gradient for one way of storing q, k and v in tensors, and what makes q, k and v of these."""
-    num = tensors.count("[")
-    gradients = ", ".join(f"d{x}" for x in tensors.replace(" rows", "").split(", "))
-    spec = f"{tensors}, {_SETTINGS} -> {_OUTPUTS}"
-    backward_spec = f"{tensors}, {_SETTINGS}, {_OUTPUTS}, dout[Q,H,D] -> {gradients}"
-    op = Op(Kernel(name, rename(spec), _check_heads), lambda *args: _reference(*split(*args[:num]), *args[num:]))
-    return op, gradient_op(op, Kernel(f"{name}_backward", rename(backward_spec), _check_heads))
-
-
-_attention, _attention_backward = _ops(
-    "attention", "q[Q,H,D] rows, k[K,H,D] rows, v[K,H,D] rows", lambda q, k, v: (q, k, v)
-)
-_attention_kv, _attention_kv_backward = _ops(
-    "attention_kv", "q[Q,H,D] rows, key_value[K,2,H,D] rows", lambda q, key_value: (q, *key_value.unbind(1))
-)
-_attention_qkv, _attention_qkv_backward = _ops(
-    "attention_qkv", "qkv[T,3,H,D] rows", lambda qkv: qkv.unbind(1), lambda spec: re.sub("[QK]", "T", spec)
-)
+_INPUTS = f"q[Q,H,D] rows, k[K,H,D] rows, v[K,H,D] rows, {_SETTINGS}"
+_attention = Op(Kernel("attention", f"{_INPUTS} -> {_OUTPUTS}", _check_heads), _reference)
+_GRADIENTS = f"{_INPUTS}, {_OUTPUTS}, dout[Q,H,D] -> dq[Q,H,D], dk[K,H,D], dv[K,H,D]"
+_attention_backward = gradient_op(_attention, Kernel("attention_backward", _GRADIENTS, _check_heads))
 
 
 def _settings(width: int, scale: float | None, dropout_p: float, seed: int) -> tuple[float, float, int]:
@@ -183,24 +167,6 @@ def attention(
     settings = _settings(q.shape[-1], scale, dropout_p, seed)
     out, maximum, total = _attention(q, k, v, q_offsets, k_offsets, *settings)
     return out, maximum + total.log()
-
-
-def cross_attention(
-    q: Tensor, key_value: Tensor, q_offsets: Tensor, k_offsets: Tensor, dropout_p: float = 0.0, seed: int = 0
-) -> Tensor:
-    """`attention` with keys and values in one tensor [Tk, 2, H, D], and with scale D^-1/2.
-
-    Their gradient has the same layout, so nothing is copied forward or backward. Returns only out [Tq, H, D].
-    """
-    return _attention_kv(q, key_value, q_offsets, k_offsets, *_settings(q.shape[-1], None, dropout_p, seed))[0]
-
-
-def self_attention(qkv: Tensor, offsets: Tensor, dropout_p: float = 0.0, seed: int = 0) -> Tensor:
-    """`attention` among the tokens of each scene, with q, k and v in one tensor [T, 3, H, D], and with scale D^-1/2.
-
-    The gradient has the same layout, so nothing is copied forward or backward. Returns only out [T, H, D].
-    """
-    return _attention_qkv(qkv, offsets, offsets, *_settings(qkv.shape[-1], None, dropout_p, seed))[0]
 
 
 # ---- the block ----

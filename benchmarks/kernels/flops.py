@@ -62,22 +62,6 @@ def _attention_backward(*inputs, **_) -> int:
     return _attention(*inputs) * 5 // 2
 
 
-def _cross_attention(q: Tensor, key_value: Tensor, *rest, **_) -> int:
-    return _attention(q, key_value, key_value, *rest)
-
-
-def _cross_attention_backward(*inputs, **_) -> int:
-    return _cross_attention(*inputs) * 5 // 2
-
-
-def _self_attention(qkv: Tensor, *rest, **_) -> int:
-    return _attention(qkv[:, 0], qkv, qkv, *rest)
-
-
-def _self_attention_backward(*inputs, **_) -> int:
-    return _self_attention(*inputs) * 5 // 2
-
-
 def _block_parts(x: Tensor, context: Tensor, rotations, context_rotations, *rest) -> tuple[int, int]:
     """Of the dense layers, and of attention."""
     q_offsets, k_offsets, *parameters = rest
@@ -121,10 +105,6 @@ FORMULAS = {
     ops.message_backward: _raw(_message_backward),
     ops.attention: _raw(_attention),
     ops.attention_backward: _raw(_attention_backward),
-    ops.attention_kv: _raw(_cross_attention),
-    ops.attention_kv_backward: _raw(_cross_attention_backward),
-    ops.attention_qkv: _raw(_self_attention),
-    ops.attention_qkv_backward: _raw(_self_attention_backward),
     ops.attention_block: _raw(_block),
     ops.attention_block_backward: _raw(_block_backward),
     ops.sparse_conv: _raw(_sparse_conv),

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ast_sim.ops import _attention as ops
 from ast_sim.ops import attention, library
-from ast_sim.ops._attention import cross_attention, dropout_factors, self_attention
+from ast_sim.ops._attention import dropout_factors
 
 
 def offsets_of(*sizes: int) -> Tensor:
@@ -314,60 +314,16 @@ def test_slices_of_a_fused_projection_are_read_in_place():
         assert torch.equal(x, y)
 
 
-def test_fused_projections_are_read_and_their_gradients_written_in_place():
-    """One tensor for k and v, or for q, k and v: the bits of the op over three tensors, forward and backward."""
-    q, k, v, *offsets = case([70, 0, 41], [33, 5, 150], 4, 32)
-    key_value = torch.stack([k, v], 1)
-    leaves, packed = [x.requires_grad_() for x in (q, k, v)], key_value.requires_grad_()
-    out, _ = attention(*leaves, *offsets, dropout_p=0.2, seed=5)
-    dout = torch.randn(out.shape)
-    dq, dk, dv = torch.autograd.grad(out, leaves, dout)
-    crossed = cross_attention(q, packed, *offsets, dropout_p=0.2, seed=5)
-    assert torch.equal(crossed, out)
-    gradients = torch.autograd.grad(crossed, [q, packed], dout)
-    assert torch.equal(gradients[0], dq) and torch.equal(gradients[1], torch.stack([dk, dv], 1))
-
+def test_gradients_of_slices_are_the_ones_of_three_tensors():
+    """To the bit."""
     q, k, v, i, _ = case([70, 0, 41], [70, 0, 41], 4, 32)
     leaves, packed = [x.requires_grad_() for x in (q, k, v)], torch.stack([q, k, v], 1).detach().requires_grad_()
     out, _ = attention(*leaves, i, i, dropout_p=0.2, seed=5)
-    alone = self_attention(packed, i, dropout_p=0.2, seed=5)
-    assert torch.equal(alone, out)
+    of_slices, _ = attention(*packed.unbind(1), i, i, dropout_p=0.2, seed=5)
+    assert torch.equal(of_slices, out)
     dout = torch.randn(out.shape)
     gradients = torch.autograd.grad(out, leaves, dout)
-    assert torch.equal(torch.autograd.grad(alone, packed, dout)[0], torch.stack(gradients, 1))
-
-
-def test_opcheck_of_fused_projections():
-    q, k, v, *offsets = case([5, 4], [6, 3], 2, 16)
-    key_value, settings = torch.stack([k, v], 1), (0.25, 0.1, 3)
-    torch.library.opcheck(
-        ops._attention_kv.overload, (q.requires_grad_(), key_value.requires_grad_(), *offsets, *settings)
-    )
-    q, key_value = q.detach(), key_value.detach()
-    saved = ops._attention_kv(q, key_value, *offsets, *settings)
-    inputs = (q, key_value, *offsets, *settings, *saved, torch.randn(q.shape))
-    torch.library.opcheck(ops._attention_kv_backward.overload, inputs)
-    qkv, i = torch.randn(9, 3, 2, 16), offsets_of(5, 4)
-    torch.library.opcheck(ops._attention_qkv.overload, (qkv.clone().requires_grad_(), i, i, *settings))
-    saved = ops._attention_qkv(qkv, i, i, *settings)
-    torch.library.opcheck(ops._attention_qkv_backward.overload, (qkv, i, i, *settings, *saved, torch.randn(9, 2, 16)))
-
-
-def test_gradients_of_fused_projections_in_float64():
-    q, k, v, *offsets = case([2, 0, 1], [2, 1, 2], 1, 16)
-    leaves = [q.double().requires_grad_(), torch.stack([k, v], 1).double().requires_grad_()]
-    assert torch.autograd.gradcheck(lambda *x: cross_attention(*x, *offsets, 0.25, 5), leaves)
-    qkv = torch.randn(3, 3, 1, 16, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda x: self_attention(x, offsets_of(2, 0, 1), 0.25, 5), qkv)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_fused_projections_must_hold_what_their_name_says(dtype):
-    q, k, _, *offsets = case([3, 2], [4, 3], 2, 16)
-    with pytest.raises(ValueError, match=r"key_value must have shape \[K, 2, 2, 16\], not \(7, 2, 16\)"):
-        cross_attention(q.to(dtype), k.to(dtype), *offsets)
-    with pytest.raises(ValueError, match=r"qkv must have shape \[T, 3, H, D\], not \(5, 2, 2, 16\)"):
-        self_attention(q.to(dtype)[:, None].expand(5, 2, 2, 16), offsets[0])
+    assert torch.equal(torch.autograd.grad(of_slices, packed, dout)[0], torch.stack(gradients, 1))
 
 
 @pytest.mark.parametrize("queries, keys", [(1300, 40), (40, 2500), (600, 1200)])

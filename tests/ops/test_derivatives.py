@@ -27,7 +27,6 @@ from ast_sim.ops import (
     sparse_conv,
     sparse_conv_transposed,
 )
-from ast_sim.ops._attention import cross_attention, self_attention
 from ast_sim.ops._segment import column_sum
 
 EDGES = EdgeSet.from_pairs(torch.tensor([0, 2, 1, 1, 3, 0, 2]), torch.tensor([1, 1, 0, 2, 2, 2, 4]), 4, 5)
@@ -69,8 +68,7 @@ OPS: dict[str, tuple[Callable, list[tuple[int, ...]]]] = {
     "attention": (lambda *x: attention(*x, *SCENES, 0.7)[0], [(5, 2, 16), (7, 2, 16), (7, 2, 16)]),
     "attention dropout": (lambda *x: attention(*x, *SCENES, 0.7, 0.3, 5)[0], [(5, 2, 16), (7, 2, 16), (7, 2, 16)]),
     "attention no keys": (lambda *x: attention(*x, *EMPTY_SCENES)[0], [(5, 1, 16), (7, 1, 16), (7, 1, 16)]),
-    "cross_attention dropout": (lambda *x: cross_attention(*x, *SCENES, 0.3, 5), [(5, 2, 16), (7, 2, 2, 16)]),
-    "self_attention dropout": (lambda x: self_attention(x, SCENES[0], 0.3, 5), [(5, 3, 2, 16)]),
+    "attention among tokens": (lambda x: attention(*x.unbind(1), *[SCENES[0]] * 2)[0], [(5, 3, 2, 16)]),
     "message_sum": (
         lambda s, r, e, a, b, c, *w: message_sum(EDGES, s, r, e, (a, b, c), *w),
         [(4, 5), (5, 5), (7, 3), (8, 3), (8,), (5, 8), *LAYERS],

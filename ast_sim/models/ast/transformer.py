@@ -5,7 +5,7 @@ Legend: T vectors (cells, tokens or nodes), C cells, B scenes, H heads of width 
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from ast_sim.models.ast.ast_config import ASTConfig
 from ast_sim.models.layers import Linear
-from ast_sim.ops import attention_block, cross_attention, rotated, self_attention
+from ast_sim.ops import attention, attention_block, rotated
 from ast_sim.ops.library import is_differentiated
 
 
@@ -76,9 +76,8 @@ class AttentionBlock(nn.Module):
         turned = [x.rotations for x in (vectors, context) if x is not None and x.rotations is not None]
         if not dropout and not any(map(is_differentiated, turned)):
             return vectors._replace(x=self._at_once(vectors, context or vectors))
-        options = {"dropout_p": dropout, "seed": int(torch.randint(2**62, (1,))) if dropout else 0}
-        mixed = self._among(vectors, options) if context is None else self._to(context, vectors, options)
-        return vectors._replace(x=self.feed_forward(self.out(mixed.flatten(1), residual=vectors.x)))
+        mixed = self._mixed(vectors, context, dropout).flatten(1)
+        return vectors._replace(x=self.feed_forward(self.out(mixed, residual=vectors.x)))
 
     def _at_once(self, vectors: Vectors, context: Vectors) -> Tensor:
         """[T, width]: the same in one call, which has neither dropout nor a gradient by the rotations."""
@@ -101,22 +100,18 @@ class AttentionBlock(nn.Module):
         offsets = vectors.offsets, context.offsets
         return attention_block(vectors.x, context.x, *turns, *offsets, parameters, self.heads)
 
-    def _among(self, vectors: Vectors, options: dict[str, Any]) -> Tensor:
-        """[T, H, D]: the vectors attend to themselves."""
-        together = self.query_key_value(self.norm(vectors.x)).unflatten(1, (3, self.heads, -1))
-        if vectors.rotations is not None:
-            query_key, value = together.split((2, 1), dim=1)
-            together = torch.cat([rotated(query_key, vectors.rotations[:, None]), value], dim=1)
-        return self_attention(together, vectors.offsets, **options)
-
-    def _to(self, context: Vectors, vectors: Vectors, options: dict[str, Any]) -> Tensor:
-        """[T, H, D]: the vectors attend to the context."""
-        query = rotated(self.query(self.norm(vectors.x)).unflatten(1, (self.heads, -1)), vectors.rotations)
-        key_value = self.key_value(self.norm_context(context.x)).unflatten(1, (2, self.heads, -1))
-        if context.rotations is not None:
-            key, value = key_value.unbind(1)
-            key_value = torch.stack([rotated(key, context.rotations), value], dim=1)
-        return cross_attention(query, key_value, vectors.offsets, context.offsets, **options)
+    def _mixed(self, vectors: Vectors, context: Vectors | None, dropout: float) -> Tensor:
+        """[T, H, D]: what attention makes of the values."""
+        x = self.norm(vectors.x)
+        if context is None:
+            q, k, v = self.query_key_value(x).unflatten(1, (3, self.heads, -1)).unbind(1)
+            context = vectors
+        else:
+            q = self.query(x).unflatten(1, (self.heads, -1))
+            k, v = self.key_value(self.norm_context(context.x)).unflatten(1, (2, self.heads, -1)).unbind(1)
+        q, k = rotated(q, vectors.rotations), rotated(k, context.rotations)
+        seed = int(torch.randint(2**62, (1,))) if dropout else 0
+        return attention(q, k, v, vectors.offsets, context.offsets, dropout_p=dropout, seed=seed)[0]
 
 
 def _of(layer: nn.LayerNorm | Linear) -> tuple[Tensor, Tensor]:
