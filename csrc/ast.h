@@ -328,9 +328,9 @@ typedef struct {
 const ast_kernels *ast_select(const char *name);
 /* The table of the i-th of the instruction sets that are supported, the best one first; NULL beyond the last. */
 const ast_kernels *ast_supported(int i);
-/* The same of the instruction sets that multiply in bfloat16 faster than others in float32. A table has attention
- * and the kernels that are made of dense layers, whose products round both factors to bfloat16 (bfloat16.h); the others
- * are NULL. */
+/* The same of the instruction sets that multiply in bfloat16 faster than others in float32. A table has attention,
+ * the sparse convolution and the kernels that are made of dense layers, whose products round both factors to bfloat16
+ * (bfloat16.h); the others are NULL. */
 const ast_kernels *ast_bfloat16(int i);
 
 /* parallel.c: runs task(i, context) for 0 <= i < tasks, on the threads of the pool if one was set, and returns the

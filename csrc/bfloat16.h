@@ -59,6 +59,16 @@ AST_INLINE void bfloat16_pack(const float *step, int64_t row, float *panel) {
       vstore(panel + k / 2 * GEMM_COLUMNS + j, (vf)bfloat16_pairs(vload(step + j), vload(step + row + j)));
 }
 
+/* A panel of B_kj = b[k*row + j*column], row or column 1, j < N <= GEMM_COLUMNS. */
+static inline void bfloat16_pack_columns(const float *b, int64_t row, int64_t column, int64_t K, int64_t N,
+                                         float *panel) {
+  for (int64_t k = 0; k < K; k += BFLOAT16_STEP) {
+    float step[BFLOAT16_STEP * GEMM_COLUMNS] = {0};
+    gemm_pack_columns(b + k * row, row, column, min64(BFLOAT16_STEP, K - k), N, GEMM_COLUMNS, step);
+    bfloat16_pack(step, GEMM_COLUMNS, panel + k / 2 * GEMM_COLUMNS);
+  }
+}
+
 /* to[k] = r(from[k]) for k < n, and 0 up to a whole step. */
 AST_INLINE void bfloat16_round_row(const float *from, int64_t n, uint16_t *to) {
   for (int64_t k = 0; k < n; k += BFLOAT16_STEP) {

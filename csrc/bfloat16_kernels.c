@@ -1,5 +1,5 @@
-/* Attention and the kernels that are made of dense layers, with products in bfloat16: the others of the table are NULL.
- * isa_amx.c and isa_avx512_bf16.c name the set of instructions and include this file. */
+/* Attention, the sparse convolution and the kernels that are made of dense layers, with products in bfloat16: the
+ * others of the table are NULL. isa_amx.c and isa_avx512_bf16.c name the set of instructions and include this file. */
 #define AST_BFLOAT16
 #include "table.h"
 
@@ -10,6 +10,7 @@
 #include "message.c"
 #include "message_backward.c" /* after message.c, whose tiles it uses */
 #include "mlp.c"
+#include "sparse_conv.c"
 
 const ast_kernels AST_TABLE(AST_ISA) = {.isa = AST_STRING(AST_ISA),
                                         .vector_bytes = AST_VECTOR_BYTES,
@@ -22,4 +23,5 @@ const ast_kernels AST_TABLE(AST_ISA) = {.isa = AST_STRING(AST_ISA),
                                         .message = message,
                                         .message_backward = message_backward,
                                         .mlp = mlp,
-                                        .mlp_backward = mlp_backward};
+                                        .mlp_backward = mlp_backward,
+                                        .sparse_conv = sparse_conv};

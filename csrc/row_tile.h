@@ -143,8 +143,8 @@ AST_INLINE void column_strip(const int vectors, int64_t rows, int64_t K, column_
 
 /* `width` columns of out, whose rows are `row` floats apart; rows of B are readable in whole vectors. base is out, or
  * NULL for 0. */
-static void column_panel(int64_t rows, int64_t width, int64_t K, column_pointers p, const float *base, float *out,
-                         int64_t row) {
+static inline void column_panel(int64_t rows, int64_t width, int64_t K, column_pointers p, const float *base,
+                                float *out, int64_t row) {
   if (width == GEMM_COLUMNS) column_strip(2, rows, K, p, base, out, row);
   else if (width == VW) column_strip(1, rows, K, p, base, out, row);
   if (width % VW == 0) return;

@@ -16,6 +16,9 @@
  */
 #include "ast.h"
 #include "row_tile.h"
+#ifdef AST_BFLOAT16
+#include "bfloat16.h"
+#endif
 
 enum {
   OFFSETS = 27,
@@ -36,15 +39,42 @@ typedef struct {
   float *out;
 } conv_job;
 
+#ifdef AST_BFLOAT16
+_Static_assert((int)PAIR_TILE <= (int)BFLOAT16_ROWS && (int)CHAIN_CHANNELS == (int)BFLOAT16_DEPTH,
+               "the rows of a tile are a block, a chain is what is rounded at a time");
+/* Fewer inputs do not fill a tile: rounding them costs more than it gains. */
+AST_INLINE bool conv_is_rounded(const conv_job *job) { return job->C_in >= BFLOAT16_STEP; }
+#endif
+
+/* Floats of a panel. */
+AST_INLINE int64_t conv_panel_size(const conv_job *job) {
+#ifdef AST_BFLOAT16
+  if (conv_is_rounded(job)) return bfloat16_panel_size(job->C_in);
+#endif
+  return job->C_in * GEMM_COLUMNS;
+}
+
+/* The panel of W_k with column c. */
+AST_INLINE float *conv_panel(const conv_job *job, int64_t k, int64_t c) {
+  return job->packed + (k * divide_up(job->C_out, GEMM_COLUMNS) + c / GEMM_COLUMNS) * conv_panel_size(job);
+}
+
 /* Packs one panel of one W_k. */
 static ast_status conv_pack_task(int64_t index, void *context) {
   const conv_job *job = context;
   const int64_t C_in = job->C_in, C_out = job->C_out, panels = divide_up(C_out, GEMM_COLUMNS);
-  const int64_t k = index / panels, column = index % panels * GEMM_COLUMNS;
+  const int64_t k = index / panels, column = index % panels * GEMM_COLUMNS, n = min64(GEMM_COLUMNS, C_out - column);
   if (job->pairs.offsets[k] == job->pairs.offsets[k + 1]) return AST_OK;
-  const float *weight = job->weight + k * C_in * C_out + column * (job->transposed ? C_in : 1);
-  gemm_pack(weight, job->transposed ? 1 : C_out, job->transposed ? C_in : 1, C_in, min64(GEMM_COLUMNS, C_out - column),
-            job->packed + k * gemm_packed_size(C_in, C_out) + column * C_in);
+  const int64_t from_row = job->transposed ? 1 : C_out, from_column = job->transposed ? C_in : 1;
+  const float *weight = job->weight + k * C_in * C_out + column * from_column;
+  float *panel = conv_panel(job, k, column);
+#ifdef AST_BFLOAT16
+  if (conv_is_rounded(job)) {
+    bfloat16_pack_columns(weight, from_row, from_column, C_in, n, panel);
+    return AST_OK;
+  }
+#endif
+  gemm_pack(weight, from_row, from_column, C_in, n, panel);
   return AST_OK;
 }
 
@@ -90,19 +120,47 @@ static void conv_point(const conv_job *job, const conv_walk *tile, int64_t first
   }
 }
 
+#ifdef AST_BFLOAT16
+/* As `conv_chain`, with products in bfloat16: all rows of the tile with one panel at a time. */
+static void conv_rounded_chain(const conv_job *job, const conv_walk *tile, const conv_rows *rows, const conv_walk *next,
+                               const conv_rows *next_rows, int64_t first, int64_t column, int64_t columns) {
+  bfloat16_block block;
+  const int64_t n = tile->n, K = min64(job->C_in - first, CHAIN_CHANNELS), panels = divide_up(columns, GEMM_COLUMNS);
+  for (int64_t i = 0; i < n; i++) bfloat16_round_row(rows->x[i], K, block.rows + i * BFLOAT16_ROW);
+  for (int64_t p = 0; p < panels; p++) {
+    const int64_t c = column + p * GEMM_COLUMNS, width = min64(GEMM_COLUMNS, job->C_out - c);
+    for (int64_t i = next->n * p / panels; i < next->n * (p + 1) / panels; i++)
+      for (int64_t k = 0; k < job->C_in; k += LINE) __builtin_prefetch(next_rows->x[i] + k, 0, 2);
+    bfloat16_products(n, round_up(K, BFLOAT16_STEP), block.rows, BFLOAT16_ROW,
+                      conv_panel(job, tile->k, c) + first / 2 * GEMM_COLUMNS, block.sums, GEMM_COLUMNS, false);
+    for (int64_t i = 0; i < n; i++)
+      for (int64_t j = 0; j < width; j += VW) {
+        const vf sum = vload_upto(rows->base[i] + c + j, width - j) + vload(block.sums + i * GEMM_COLUMNS + j);
+        vstore_upto(rows->out[i] + c + j, sum, width - j);
+      }
+  }
+}
+#endif
+
 /* The products of channels first.. of the rows of a tile, strip by strip and panel by panel, while the rows of the next
  * are fetched. Inlined with its strips: 128 channels are so few products that a call for each would cost 4 to 7 %. */
 AST_INLINE void conv_chain(const conv_job *job, const conv_walk *tile, const conv_rows *rows, const conv_walk *next,
                            const conv_rows *next_rows, int64_t first, int64_t column, int64_t columns) {
-  const int64_t C_in = job->C_in, C_out = job->C_out, n = tile->n, K = min64(C_in - first, CHAIN_CHANNELS);
-  const float *weight = job->packed + tile->k * gemm_packed_size(C_in, C_out) + first * GEMM_COLUMNS;
+#ifdef AST_BFLOAT16
+  if (conv_is_rounded(job)) {
+    conv_rounded_chain(job, tile, rows, next, next_rows, first, column, columns);
+    return;
+  }
+#endif
+  const int64_t C_out = job->C_out, n = tile->n, K = min64(job->C_in - first, CHAIN_CHANNELS);
   const int64_t strips = row_strips(n), parts = strips * divide_up(columns, GEMM_COLUMNS);
   for (int64_t c = column, part = 0; c < column + columns; c += GEMM_COLUMNS)
     for (int64_t strip = 0; strip < strips; strip++, part++) {
       const int64_t i = n * strip / strips, f = next->n * part / parts, f_end = next->n * (part + 1) / parts;
       const row_pointers pointers = {rows->x + i, rows->base + i, rows->out + i};
       const row_fetch fetch = {next_rows->x + f, next_rows->out + f, f_end - f};
-      row_panel(n * (strip + 1) / strips - i, min64(GEMM_COLUMNS, C_out - c), K, pointers, fetch, weight + c * C_in, c);
+      row_panel(n * (strip + 1) / strips - i, min64(GEMM_COLUMNS, C_out - c), K, pointers, fetch,
+                conv_panel(job, tile->k, c) + first * GEMM_COLUMNS, c);
     }
 }
 
@@ -165,19 +223,19 @@ static ast_status sparse_conv(const float *restrict x, const float *restrict wei
                               float *restrict out) {
   AST_SCRATCH_SCOPE;
   if (num_out == 0 || C_out == 0) return AST_OK;
-  float *packed = ast_scratch(OFFSETS * gemm_packed_size(C_in, C_out) * (int64_t)sizeof *packed);
-  if (!packed) return AST_NO_MEMORY;
   conv_job job = {.x = x,
                   .weight = weight,
                   .bias = bias,
-                  .packed = packed,
                   .C_in = C_in,
                   .C_out = C_out,
                   .num_out = num_out,
                   .transposed = transposed,
                   .pairs = pairs,
                   .out = out};
+  const int64_t panels = OFFSETS * divide_up(C_out, GEMM_COLUMNS);
+  job.packed = ast_scratch(panels * conv_panel_size(&job) * (int64_t)sizeof *job.packed);
+  if (!job.packed) return AST_NO_MEMORY;
   conv_cut(&job);
-  const ast_status status = ast_parallel(OFFSETS * divide_up(C_out, GEMM_COLUMNS), conv_pack_task, &job);
+  const ast_status status = ast_parallel(panels, conv_pack_task, &job);
   return status == AST_OK ? ast_parallel(divide_up(num_out, job.rows) * job.column_tasks, conv_task, &job) : status;
 }

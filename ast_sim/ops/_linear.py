@@ -98,10 +98,11 @@ def linear(
 def products_in(precision: Precision) -> Iterator[None]:
     """The ops of this thread multiply in this precision meanwhile.
 
-    With "bfloat16" `linear`, `mlp`, `message_sum`, `message_edges`, `attention_block` and the gradients of their inputs
-    round both factors of a product of at least 32 inputs to 8 binary digits, and attention the factors of its scores
-    and of the weighted values. Sums, activations, the gradients of weights and of attention stay in float32. All
-    results depend on neither threads nor batch, as in float32.
+    With "bfloat16" `linear`, `mlp`, `message_sum`, `message_edges`, `attention_block`, `sparse_conv`,
+    `sparse_conv_transposed` and the gradients of their inputs round both factors of a product of at least 32 inputs to
+    8 binary digits, and attention the factors of its scores and of the weighted values. Sums, activations, the
+    gradients of weights and of attention stay in float32. All results depend on neither threads nor batch, as in
+    float32.
 
     Warns, and changes nothing, where the processor multiplies no faster in bfloat16 (it has neither AMX nor, from AMD,
     AVX512-BF16), and where AST_SIM_ISA or AST_SIM_BACKEND chooses other kernels.

@@ -93,6 +93,22 @@ static void check_message(const ast_kernels *low, const ast_kernels *full, int64
   FREE(sum, expected, MESSAGE_BUFFERS(&s));
 }
 
+static void check_conv(const ast_kernels *low, const ast_kernels *full, int64_t sources, int64_t destinations,
+                       int64_t C_in, int64_t C_out, bool transposed) {
+  const ast_pairs pairs = random_pairs(sources, destinations, 0.2, 1);
+  float *x = whole_floats(sources * C_in), *weight = whole_floats(OFFSETS * C_in * C_out), *bias = whole_floats(C_out);
+  float *out[2];
+  for (int i = 0; i < 2; i++) {
+    out[i] = new_floats(destinations * C_out);
+    CHECK(
+        (i ? full : low)->sparse_conv(x, weight, bias, C_in, C_out, transposed, pairs, destinations, out[i]) == AST_OK,
+        "status");
+  }
+  CHECK(same_bits(out[0], out[1], destinations * C_out), "convolution of %lld to %lld channels", (long long)C_in,
+        (long long)C_out);
+  FREE(PAIR_BUFFERS(&pairs), x, weight, bias, out[0], out[1]);
+}
+
 static void test_exact_factors(const ast_kernels *low, const ast_kernels *full) {
   static const int64_t sizes[][3] = {{0, 40, 4},    {1, 32, 2},   {7, 33, 6},     {13, 64, 64},   {96, 32, 32},
                                      {97, 128, 30}, {200, 5, 12}, {300, 513, 70}, {31, 1100, 34}, {400, 96, 256}};
@@ -104,6 +120,14 @@ static void test_exact_factors(const ast_kernels *low, const ast_kernels *full) 
   check_message(low, full, 1000, (const int64_t[]){8, 64, 64, 64});
   check_message(low, full, 97, (const int64_t[]){40, 33, 70, 34});
   check_message(low, full, 500, (const int64_t[]){64, 0, 64, 48});
+  for (int transposed = 0; transposed < 2; transposed++) {
+    check_conv(low, full, 40, 300, 5, 33, transposed); /* too few channels to be rounded */
+    check_conv(low, full, 700, 129, 33, 30, transposed);
+    check_conv(low, full, 60, 900, 64, 70, transposed);
+    check_conv(low, full, 30, 50, 1100, 34, transposed); /* several chains */
+    check_conv(low, full, 50, 3, 64, 150, transposed);   /* ranges of columns */
+    check_conv(low, full, 0, 9, 64, 64, transposed);
+  }
 }
 
 /* ---- factors that are rounded ---- */
@@ -200,6 +224,26 @@ static void test_rows_alone(const ast_kernels *low) {
   FREE(x, weight, all, one);
 }
 
+/* A row of a convolution has the same bits whatever other rows there are, by any number of threads. */
+static void test_conv_rows_alone(const ast_kernels *low) {
+  const int64_t C_in = 70, C_out = 45, n = 600;
+  const ast_pairs pairs = random_pairs(n, n, 0.3, 1);
+  float *x = random_floats(n * C_in), *weight = random_floats(OFFSETS * C_in * C_out);
+  float *all = new_floats(n * C_out), *first = new_floats(n * C_out);
+  int64_t *source = new_ints(pairs.offsets[OFFSETS]), *destination = new_ints(pairs.offsets[OFFSETS]);
+  int64_t offsets[OFFSETS + 1] = {0}, num = 0;
+  for (int k = 0; k < OFFSETS; k++) { /* the pairs of the rows before the 200th */
+    for (int64_t i = pairs.offsets[k]; i < pairs.offsets[k + 1]; i++)
+      if (pairs.destination[i] < 200) source[num] = pairs.source[i], destination[num++] = pairs.destination[i];
+    offsets[k + 1] = num;
+  }
+  const ast_pairs some = copy_pairs(offsets, source, destination);
+  CHECK(low->sparse_conv(x, weight, NULL, C_in, C_out, false, pairs, n, all) == AST_OK, "status");
+  CHECK(low->sparse_conv(x, weight, NULL, C_in, C_out, false, some, 200, first) == AST_OK, "status");
+  CHECK(same_bits(first, all, 200 * C_out), "rows of a convolution alone");
+  FREE(PAIR_BUFFERS(&pairs), PAIR_BUFFERS(&some), x, weight, all, first, source, destination);
+}
+
 static void test(const ast_kernels *low, const ast_kernels *full) {
   for (int threaded = 0; threaded < 2; threaded++) {
     check_state = 1;
@@ -210,6 +254,7 @@ static void test(const ast_kernels *low, const ast_kernels *full) {
     test_rounding(low);
     test_subnormal(low);
     test_rows_alone(low);
+    test_conv_rows_alone(low);
     if (threaded) pool_stop();
     CHECK(num_buffers == 0, "%d buffers are not freed", num_buffers);
     printf("  %s, %d byte vectors, %s: passed\n", low->isa, low->vector_bytes, threaded ? "threads" : "serial");

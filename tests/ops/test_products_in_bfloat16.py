@@ -14,11 +14,14 @@ from ast_sim.ops import (
     _linear,
     _message,
     _mlp,
+    _sparse_conv,
     attention_block,
     linear,
     message_sum,
     mlp,
+    octree,
     products_in,
+    sparse_conv,
 )
 from ast_sim.ops.library import configuration
 from ast_sim.support.errors import ConfigError
@@ -75,7 +78,27 @@ def attention_case():
     )
 
 
-CASES = {"linear": linear_case, "mlp": mlp_case, "message": message_case, "attention": attention_case}
+def conv_case():
+    g = torch.Generator().manual_seed(0)
+    positions = torch.rand(3000, 3, generator=g)
+    level = octree(positions, torch.tensor([0, len(positions)]), (0.5, 0.5, 0.5), 0.5, 5)
+    step = level.coarsen()
+    inputs = [10 * normal(step.num_fine, 64), normal(27, 64, 48, seed=1), normal(48)]
+    pairs = (False, step.pair_offsets, step.fine, step.coarse_index, step.coarse_by_fine, step.fine_by_fine)
+
+    def composed(x, weight, bias):
+        return _sparse_conv._reference(x, weight, bias, *pairs, len(step.coarse.keys))
+
+    return lambda x, weight, bias: sparse_conv(x, weight, step, bias), composed, inputs
+
+
+CASES = {
+    "linear": linear_case,
+    "mlp": mlp_case,
+    "message": message_case,
+    "attention": attention_case,
+    "conv": conv_case,
+}
 
 
 def off(results: list[Tensor], exact: list[Tensor]) -> list[float]:
