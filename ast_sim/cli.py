@@ -135,7 +135,7 @@ def _add_generate(generate: Parser) -> None:
     add_each(generate, sizes, type=at_least(1))
     about = "solve and store only frame 0 and these, such as 1,5,20, each straight from the one before (default: all)"
     generate.add_argument("--keep", type=whole_numbers, metavar="K,K,...", help=about)
-    about = "order of the tetrahedra: 1 (four nodes), or 2 (ten nodes, with accurate forces) (default: 1)"
+    about = "order of the tetrahedra: 1 (four nodes), or 2 (ten nodes, with better forces) (default: 1)"
     generate.add_argument("--order", type=int, choices=(1, 2), help=about)
     generate.add_argument("--seed", type=at_least(0), default=0, help="seed of the scenes (default: 0)")
     about = "the bundled solver (own) or CalculiX (default: own; CalculiX if a part is elastoplastic)"
