@@ -23,6 +23,7 @@ def describe_dataset(path: Path) -> dict[str, Any]:
         across = AcrossSimulations()
         filled = [split for split, count in dataset.splits.items() if count]
         splits = {split: _describe_split(dataset, split, findings, across) for split in filled}
+        findings += across.all_together()
         return {
             "kind": "dataset",
             "path": str(path),

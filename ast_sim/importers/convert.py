@@ -120,6 +120,7 @@ def convert_series(
             findings += [(name, one) for one in (*in_trajectory(trajectory), *across.look(name, trajectory))]
             writer.add(split, trajectory)
             bar.advance(_line(split, name, trajectory))
+        findings += across.all_together()
         _tell(source, findings, strict)
     return writer.counts
 

@@ -45,6 +45,7 @@ class MeshFile:
         groups: the numbers of the points of each named group.
         shells: if there are shells beside the tetrahedra; their layers are among the elements and the points.
         edges: [M, 2] the points at the ends of the edges in whose middles the last M points lie.
+        mirrored: whether all elements were inside out in the file.
     """
 
     source: SourceMesh
@@ -56,6 +57,7 @@ class MeshFile:
     groups: dict[str, np.ndarray]
     shells: Shells | None = None
     edges: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), np.int64))
+    mirrored: bool = False
 
     @property
     def path(self) -> Path:
@@ -254,7 +256,7 @@ def mesh_of(mesh: SourceMesh, stitching: Stitching, corners: bool = False) -> Me
         elements = np.concatenate([elements, shells.tetrahedra(points)])
         node_rows = np.concatenate([node_rows, shells.nodes])
         element_rows = np.concatenate([element_rows, np.repeat(rows, 3)])
-    plain = MeshFile(mesh, points, elements, node_rows, element_rows, notes, groups, shells)
+    plain = MeshFile(mesh, points, elements, node_rows, element_rows, notes, groups, shells, mirrored=taken.mirrored)
     return plain if taken.middles is None else _of_second_order(plain, taken.middles)
 
 

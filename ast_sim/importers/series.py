@@ -29,6 +29,7 @@ from ast_sim.importers.solids.stitching import Stitching
 from ast_sim.importers.solved_jobs.job import Job, read_job
 from ast_sim.importers.solved_jobs.job_results import job_frames
 from ast_sim.importers.stress import STRESS_UNITS, order_of, von_mises
+from ast_sim.plausibility.axes import MIRRORED
 from ast_sim.scene import NodeType, Scene, Trajectory
 from ast_sim.support.argument_checks import several
 from ast_sim.support.errors import ConfigError, DatasetError
@@ -147,7 +148,7 @@ def read_series(
         scene,
         (position - origin).astype(np.float32),
         stress,
-        _attributes(source, origin, names, told),
+        _attributes(source, origin, names, told) | ({MIRRORED: 1} if mesh.mirrored else {}),
         stress_location=place,
         times=kept.ascending_times(),
         fields=fields,

@@ -1,4 +1,5 @@
-"""What looks wrong between the simulations of a dataset: one that stands in it twice, one in another unit of length."""
+"""What looks wrong between the simulations of a dataset: one that stands in it twice, one in another unit of length or
+of stress, one with its axes in another order."""
 
 from __future__ import annotations
 
@@ -6,7 +7,9 @@ import hashlib
 
 import numpy as np
 
+from ast_sim.plausibility.axes import Axes, axes, other_order
 from ast_sim.plausibility.findings import Finding
+from ast_sim.plausibility.units import Moduli, Stiffness, moduli, other_moduli, other_stress, stiffness
 from ast_sim.scene import Trajectory
 
 # Sizes of scenes that differ by more than this tell of two units, such as mm and m.
@@ -14,15 +17,29 @@ _UNITS = 100.0
 
 
 class AcrossSimulations:
-    """Compares each simulation with those before."""
+    """Compares the simulations of a dataset."""
 
     def __init__(self) -> None:
         self.names: dict[bytes, str] = {}  # by a digest of the frames
         self.first: tuple[str, float] | None = None  # the name and the size of the first scene
+        self.stiffness: list[tuple[str, Stiffness]] = []
+        self.moduli: list[tuple[str, Moduli]] = []
+        self.axes: list[tuple[str, Axes]] = []
 
     def look(self, name: str, trajectory: Trajectory) -> list[Finding]:
         """What looks wrong in a simulation beside those before."""
+        stiff = stiffness(trajectory)
+        self.stiffness += [] if stiff is None else [(name, stiff)]
+        self.moduli.append((name, moduli(trajectory)))
+        self.axes.append((name, axes(trajectory)))
         return [*self._repeats(name, trajectory), *self._other_unit(name, trajectory)]
+
+    def all_together(self) -> list[tuple[str, Finding]]:
+        """What looks wrong in some simulations beside all others, by name; after the last look."""
+        stresses = other_stress(self.stiffness)
+        told = {name for name, _ in stresses}
+        units = [(name, one) for name, one in other_moduli(self.moduli) if name not in told]
+        return [*stresses, *units, *other_order(self.axes)]
 
     def _repeats(self, name: str, trajectory: Trajectory) -> list[Finding]:
         content = hashlib.sha256(np.ascontiguousarray(trajectory.scene.elements).data)

@@ -56,8 +56,9 @@ def _rows(findings: Findings) -> list[tuple[str, str, str]]:
     rows = []
     for what, of_kind in kinds.items():
         name, first = of_kind[0]
-        count = len({name for name, _ in of_kind})
-        several = f"in {count} simulations; " if count > 1 else ""
+        names = list(dict.fromkeys(name for name, _ in of_kind))
+        listed = ", ".join(names[:_PLACES]) + (", ..." if len(names) > _PLACES else "")
+        several = f"in {len(names)} simulations ({listed}); " if len(names) > 1 else ""
         total = sum(finding.count for _, finding in of_kind)
         rows.append((f"{total} {what}", f"{several}{name}: {first.places}", first.meaning))
     return rows

@@ -1,6 +1,6 @@
 """What looks wrong in the frames of a simulation: tools that change their shape, displacements in other units, elements
 that turn over, frames that repeat, bodies that change their places, displacements from the frame before, no motion,
-Poisson's ratios that cannot be one, contact that no model can see.
+Poisson's ratios and yield stresses that cannot be one, contact that no model can see.
 
 Legend: S frames, N nodes, E elements.
 """
@@ -18,6 +18,7 @@ from ast_sim.plausibility.body_places import change_places
 from ast_sim.plausibility.findings import Finding, places
 from ast_sim.plausibility.increments import counted_from_frame_before
 from ast_sim.plausibility.topology import at_rest
+from ast_sim.plausibility.units import yielding
 from ast_sim.scene import Scene, Trajectory
 
 # Edges of an obstacle keep their lengths up to this share of the longest edge.
@@ -44,6 +45,7 @@ def in_trajectory(trajectory: Trajectory) -> list[Finding]:
     findings = [
         *at_rest(scene),
         *_poisson(trajectory),
+        *yielding(trajectory),
         *_still(scene, position),
         *_far(scene, position),
         *_soft_tools(scene, position),

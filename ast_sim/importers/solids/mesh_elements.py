@@ -33,6 +33,7 @@ class Elements:
         rows: [E] int64 the cell that each is part of, counted over all blocks of the file.
         blocks: the numbers of the blocks that became elements.
         notes: sentences on what was changed.
+        mirrored: whether all elements were inside out.
     """
 
     nodes: np.ndarray
@@ -40,6 +41,7 @@ class Elements:
     rows: np.ndarray
     blocks: list[int]
     notes: list[str]
+    mirrored: bool = False
 
 
 def elements_of(mesh: SourceMesh, point_of: np.ndarray, corners: bool = False) -> Elements:
@@ -91,7 +93,8 @@ def elements_of(mesh: SourceMesh, point_of: np.ndarray, corners: bool = False) -
     turned, more = _turned_over(mesh, elements, row, starts)
     elements[turned] = elements[turned][:, [0, 1, 3, 2]]
     middle[turned] = middle[turned][:, TURNED]
-    return Elements(elements, middle if second else None, row, chosen, [*said, *more])
+    mirrored = bool(turned.all()) and all(mesh.blocks[index].shape != "wedge" for index in chosen)
+    return Elements(elements, middle if second else None, row, chosen, [*said, *more], mirrored)
 
 
 def _reduced(mesh: SourceMesh, chosen: list[int], corners: bool) -> list[str]:
