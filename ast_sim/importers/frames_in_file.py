@@ -16,24 +16,45 @@ import h5py
 import numpy as np
 
 from ast_sim.importers.decks.deck_mesh import deck_mesh
-from ast_sim.importers.formats.gmsh_files import gmsh_mesh
+from ast_sim.importers.formats.gmsh_fields import has_steps
+from ast_sim.importers.formats.gmsh_files import gmsh_frames
 from ast_sim.importers.formats.source_mesh import CellBlock, SourceMesh, from_meshio
 from ast_sim.importers.formats.stl_file import BadSurface, read_stl
 from ast_sim.importers.formats.vtk_files import BLOCKS, ENDINGS, is_dyna, vtk_frames
 from ast_sim.support.errors import DatasetError
 
 # Formats whose files hold all frames of a simulation.
-WITH_FRAMES = (".vtkhdf", ".frd", ".xdmf", ".xmf", ".e", ".ex2", ".exo", ".exoii", ".exii")
+WITH_FRAMES = (".vtkhdf", ".frd", ".e", ".ex2", ".exo", ".exoii", ".exii")
 
-# Formats in which each frame is a file of its own.
-ONE_FRAME = (".vtu", ".pvtu", ".vtk", ".vtp", ".pvtp", ".vts", ".pvts", *BLOCKS, ".msh")
+# Formats in which each frame is a file of its own; files of the last ones may hold all frames.
+XDMF = (".xdmf", ".xmf")
+ONE_FRAME = (".vtu", ".pvtu", ".vtk", ".vtp", ".pvtp", ".vts", ".pvts", *BLOCKS, *XDMF, ".msh")
 
 _INSTEAD = "write it as .vtu, .vtk, .msh or .inp"
 
 
 def holds_frames(path: Path) -> bool:
     """Whether a file holds all frames of a simulation."""
-    return path.suffix.lower() in WITH_FRAMES or is_dyna(path)
+    ending = path.suffix.lower()
+    if ending in XDMF:
+        return re.search(rb"GridType\s*=\s*[\"']Collection", path.read_bytes()) is not None
+    return ending in WITH_FRAMES or is_dyna(path) or (ending == ".msh" and has_steps(path))
+
+
+def only_frame(path: Path) -> SourceMesh:
+    """The frame of a file that is one frame of a simulation.
+
+    Raises:
+        DatasetError: it holds several frames; else as in `frames_in`.
+    """
+    frames = frames_in(path)
+    frame = next(frames)
+    if next(frames, None) is not None:
+        raise DatasetError(
+            f"{path}: holds several frames, and a file of a series must be one: convert it alone, or write a file for"
+            " each frame"
+        )
+    return frame
 
 
 def frames_in(path: Path) -> Iterator[SourceMesh]:
@@ -51,10 +72,10 @@ def frames_in(path: Path) -> Iterator[SourceMesh]:
     elif ending == ".inp":
         yield deck_mesh(path)
     elif ending == ".msh" and b"$MeshFormat" in _beginning(path):
-        yield gmsh_mesh(path)
+        yield from gmsh_frames(path)
     elif ending == ".stl":
         yield _surface(path)
-    elif ending in (".xdmf", ".xmf"):
+    elif ending in XDMF:
         yield from _xdmf_frames(path)
     else:
         yield _by_meshio(path)
@@ -137,10 +158,11 @@ def _xdmf_frames(path: Path) -> Iterator[SourceMesh]:
         )
     named = ", ".join(dict.fromkeys(one.get("Name", "without a name") for one in tree.iter("Set")))
     sets = [f"sets are not read: {named}"] if named else []
-    with _beside(path, tree, _with_grid_types(tree)) as copy:
+    time, timed = (None, False) if series else _without_time(path, tree)
+    with _beside(path, tree, _with_grid_types(tree) or timed) as copy:
         if not series:
             mesh = _by_meshio(path, copy)
-            yield replace(mesh, notes=[*mesh.notes, *sets])
+            yield replace(mesh, time=time, notes=[*mesh.notes, *sets])
             return
         _require_plain(path, series)
         _require_no_other(path, tree, series[0])
@@ -159,6 +181,18 @@ def _xdmf_frames(path: Path) -> Iterator[SourceMesh]:
             raise
         except (Exception, SystemExit) as error:
             raise DatasetError(f"{path}: cannot be read as a mesh: {_told(error)}") from error
+
+
+def _without_time(path: Path, tree: ET.ElementTree[Any]) -> tuple[float | None, bool]:
+    """Take the time out of the grid of a file without a series: meshio refuses it. What it says, and whether there was
+    one."""
+    said = [(grid, time) for grid in tree.iter("Grid") for time in grid.findall("Time")]
+    for grid, time in said:
+        grid.remove(time)
+    try:
+        return (float(said[0][1].attrib["Value"]) if said else None), bool(said)
+    except (KeyError, ValueError) as error:
+        raise DatasetError(f"{path}: the Time of its grid has no Value that is a number") from error
 
 
 def _with_grid_types(tree: ET.ElementTree[Any]) -> bool:

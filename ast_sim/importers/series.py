@@ -13,7 +13,7 @@ import numpy as np
 
 from ast_sim.importers.formats.source_mesh import SourceMesh
 from ast_sim.importers.formats.together import labelled, require_one_time, together
-from ast_sim.importers.frames_in_file import frames_in
+from ast_sim.importers.frames_in_file import frames_in, only_frame
 from ast_sim.importers.mesh_file import MeshFile, mesh_of, raw_field
 from ast_sim.importers.order_of_files.by_name import ordered
 from ast_sim.importers.order_of_files.doubts import doubts_of_times
@@ -228,11 +228,11 @@ def frames(source: Path) -> Iterator[SourceMesh]:
         if len(files) > 1:
             labels = of_frames.labels or [""] * len(files)
             pairs = zip(files, labels, strict=True)
-            parts = [labelled(next(frames_in(file)), label) for file, label in pairs]
+            parts = [labelled(only_frame(file), label) for file, label in pairs]
             require_one_time(parts)
             yield together(parts)
-        elif source.is_dir():
-            yield next(frames_in(files[0]))
+        elif source.is_dir() or len(of_frames.files) > 1:
+            yield only_frame(files[0])
         else:
             yield from frames_in(files[0])
 

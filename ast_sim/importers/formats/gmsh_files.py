@@ -8,12 +8,14 @@ to an entity. Source: the reference manual of Gmsh, chapter "File formats".
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from ast_sim.importers.formats.gmsh_bytes import Reader, Section
+from ast_sim.importers.formats.gmsh_fields import GmshField, with_fields
 from ast_sim.importers.formats.source_mesh import CellBlock, SourceMesh, node_count
 from ast_sim.support.errors import DatasetError
 
@@ -65,7 +67,7 @@ class _Content:
     node_numbers: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
     points: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
     blocks: list[_Block] = field(default_factory=list)
-    data: list[tuple[str, str, float, np.ndarray, np.ndarray]] = field(default_factory=list)
+    data: list[GmshField] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
 
@@ -81,11 +83,13 @@ class _Block:
     entity: np.ndarray
 
 
-def gmsh_mesh(path: Path) -> SourceMesh:
-    """The mesh of a file. Groups are its physical groups; one without a name is called by its number.
+def gmsh_frames(path: Path) -> Iterator[SourceMesh]:
+    """The frames of a file, one for each step of its fields, or one. Groups are its physical groups; one without a name
+    is called by its number.
 
     Raises:
-        DatasetError: the file is damaged, or of another format; the text names it.
+        DatasetError: the file is damaged, or of another format, or its fields are of different steps; the text names
+            it.
     """
     reader = Reader(path)
     content = _Content()
@@ -95,7 +99,9 @@ def gmsh_mesh(path: Path) -> SourceMesh:
     except (ValueError, IndexError, KeyError, OverflowError, MemoryError) as error:
         told = " ".join(str(error).split()) or type(error).__name__
         raise DatasetError(f"{path}: cannot be read as a mesh: it is damaged: {told}") from error
-    return _source(path, content)
+    mesh = _source(path, content)
+    blocks = [block.numbers for block in content.blocks]
+    yield from with_fields(mesh, content.node_numbers, blocks, content.data)
 
 
 def _take(section: Section, content: _Content) -> None:
@@ -112,7 +118,7 @@ def _take(section: Section, content: _Content) -> None:
         case "Elements":
             (_elements_4 if new else _elements_2)(section, content)
         case "NodeData" | "ElementData":
-            content.data.append((section.name, *_data(section)))
+            content.data.append(_data(section))
         case "ElementNodeData":
             content.notes.append("a field with values at the nodes of each element is left out")
             section.skip()
@@ -212,14 +218,14 @@ def _kind(number: int) -> str:
     return _KINDS[number]
 
 
-def _data(section: Section) -> tuple[str, float, np.ndarray, np.ndarray]:
-    """Name, time, numbers [n] and values [n, columns] of a field."""
+def _data(section: Section) -> GmshField:
     texts = [section.line().strip().strip('"') for _ in range(int(section.line()))]
     reals = [float(section.line()) for _ in range(int(section.line()))]
     facts = [int(section.line()) for _ in range(int(section.line()))]
     columns, count = facts[1], facts[2]
     numbers, values = section.records_of_data(count, columns)
-    return texts[0] if texts else "", reals[0] if reals else 0.0, numbers, values
+    name = texts[0] if texts else ""
+    return GmshField(section.name == "NodeData", name, facts[0], reals[0] if reals else 0.0, numbers, values)
 
 
 def _source(path: Path, content: _Content) -> SourceMesh:
@@ -247,7 +253,6 @@ def _source(path: Path, content: _Content) -> SourceMesh:
             content.notes.append(
                 f"the group {name!r} holds all physical groups of this name, here of dimension {key[0]}"
             )
-    point_fields, cell_fields = _fields(content, order, sorted_numbers)
     tags = {
         "gmsh:physical": [b.physical for b in content.blocks],
         "gmsh:geometrical": [b.entity for b in content.blocks],
@@ -256,39 +261,9 @@ def _source(path: Path, content: _Content) -> SourceMesh:
         path,
         content.points,
         blocks,
-        point_fields,
-        {**tags, **cell_fields},
+        {},
+        tags,
         {name: np.unique(np.concatenate([np.zeros(0, np.int64), *parts])) for name, parts in groups.items()},
         content.notes,
         same_point=content.node_numbers,
     )
-
-
-def _fields(
-    content: _Content, order: np.ndarray, sorted_numbers: np.ndarray
-) -> tuple[dict[str, np.ndarray], dict[str, list[np.ndarray]]]:
-    """The fields of points and cells, NaN where a field has no value. Of several times the first is taken."""
-    point_fields: dict[str, np.ndarray] = {}
-    cell_fields: dict[str, list[np.ndarray]] = {}
-    for place, name, time, numbers, values in content.data:
-        if name in (point_fields if place == "NodeData" else cell_fields):
-            content.notes.append(f"the field {name!r} at the time {time:g} is left out: the first time is taken")
-        elif place == "NodeData":
-            point_fields[name] = _placed(numbers, values, sorted_numbers)[np.argsort(order)]
-        else:
-            cell_fields[name] = []
-            for block in content.blocks:
-                by_number = np.argsort(block.numbers)
-                placed = _placed(numbers, values, block.numbers[by_number])
-                cell_fields[name].append(placed[np.argsort(by_number)])
-    return point_fields, cell_fields
-
-
-def _placed(numbers: np.ndarray, values: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """[wanted, columns]: the value of each of the wanted numbers, which ascend."""
-    placed = np.full((len(wanted), values.shape[1]), np.nan)
-    if len(wanted):
-        row = np.minimum(np.searchsorted(wanted, numbers), len(wanted) - 1)
-        there = wanted[row] == numbers
-        placed[row[there]] = values[there]
-    return placed[:, 0] if values.shape[1] == 1 else placed

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from ast_sim.importers.formats.vtk_files import BLOCKS
-from ast_sim.importers.frames_in_file import ONE_FRAME, holds_frames
+from ast_sim.importers.frames_in_file import ONE_FRAME, XDMF, holds_frames
 from ast_sim.importers.order_of_files.by_name import natural_order
 from ast_sim.importers.order_of_files.left_out import left_out
 from ast_sim.importers.order_of_files.listed import SERIES, FrameFiles, in_collection, in_series
@@ -40,7 +40,7 @@ def frame_files(source: Path) -> FrameFiles:
 def files_of_frames(folder: Path) -> list[Path]:
     """The files of a folder that are a frame each. Pieces that a .pvtu or .vtm file lists are not counted."""
     entries = [entry for entry in folder.iterdir() if entry.is_file() and not entry.name.startswith(".")]
-    kinds = ((".pvtu",), (".pvts",), BLOCKS, (".vtu",), (".vts",), (".vtk",), (".pvtp",), (".vtp",), (".msh",))
+    kinds = ((".pvtu",), (".pvts",), BLOCKS, (".vtu",), (".vts",), (".vtk",), (".pvtp",), (".vtp",), XDMF, (".msh",))
     for endings in kinds:
         files = [entry for entry in entries if entry.suffix.lower() in endings]
         if files:
