@@ -4,6 +4,7 @@ import meshio
 import numpy as np
 import pytest
 from blocks import block
+from scipy.spatial.transform import Rotation
 
 from ast_sim.importers.series import FieldNames, read_series
 from ast_sim.plausibility.motion import in_trajectory
@@ -71,6 +72,46 @@ def test_the_frames_are_named():
 )
 def test_displacements_from_rest_are_not_told(travel):
     assert told(displacements(np.asarray(travel, float))) == []
+
+
+def turning(angles, axis=1, pivot=(1, 1, 2 + GAP), shift=0.0):
+    """[S, N, 3]: the upper cube turns about an axis through a point of it, and goes down; the lower one leans."""
+    moved = np.zeros((len(angles), *REST.shape))
+    for frame, angle in enumerate(angles):
+        turn = Rotation.from_rotvec(np.eye(3)[axis] * angle).as_matrix()
+        moved[frame, TOOL] = (REST[TOOL] - pivot) @ turn.T + pivot - REST[TOOL] - (0, 0, shift * frame)
+        moved[frame, ~TOOL, 0] = 0.1 * np.sin(angle) * REST[~TOOL, 2]
+    return moved
+
+
+TURNS = {
+    "even": EVEN,
+    "faster and faster": EVEN**2,
+    "to and fro": np.sin(2 * np.pi * EVEN),
+    "random": np.random.default_rng(0).uniform(size=FRAMES),
+}
+
+
+def shapes(moved):
+    findings = in_trajectory(Trajectory(SCENE, (REST + moved).astype(np.float32)))
+    return [one.count for one in findings if one.what == "frames in which prescribed nodes change their shape"]
+
+
+@pytest.mark.parametrize("angle", [0.05, 0.5, 3.0])
+@pytest.mark.parametrize("profile", TURNS)
+@pytest.mark.parametrize("shift", [0, 0.02])
+def test_tools_that_turn_tell_displacements_from_the_frame_before(angle, profile, shift):
+    moved = turning(angle * TURNS[profile], shift=shift)
+    assert shapes(moved) == [] and told(moved) == []
+    before = from_frame_before(moved)
+    assert told(before) != [] or shapes(before) != [] or angle < 0.5  # small turns leave the shape as it is
+
+
+def test_the_frames_in_which_the_shape_changes_are_counted():
+    assert shapes(from_frame_before(turning(3 * EVEN))) == [19]
+    soft = turning(EVEN)
+    soft[:, TOOL] *= 1 + 0.1 * REST[TOOL, :1]  # no rigid tool, which is another finding
+    assert shapes(soft) == []
 
 
 def test_a_load_on_a_body_that_is_held_is_not_told():
