@@ -30,10 +30,19 @@ _NAMED = {
     "ZASYMM": (1, 2, 6),
 }
 
+# With these options of *BOUNDARY the values come from other results or from a subroutine.
+_FROM_ELSEWHERE = {"SUBMODEL", "USER"}
+
+# Elements in a plane, whose nodes go nowhere along z.
+_PLANE = ("CPE", "CPS", "CPEG", "CAX", "CGAX")
+
 # What acts on nodes and is in no scene.
-_LOADS = {"CLOAD", "DLOAD", "DSLOAD", "TEMPERATURE", "DFLUX", "CFLUX", "FILM", "RADIATE", "PRETENSIONSECTION"}
+_LOADS = {"CLOAD", "DLOAD", "DSLOAD", "TEMPERATURE", "DFLUX", "CFLUX", "FILM", "RADIATE", "PRE-TENSIONSECTION"}
 _CONSTRAINTS = {"EQUATION", "MPC", "COUPLING", "KINEMATIC", "DISTRIBUTING", "DISTRIBUTINGCOUPLING", "TIE"}
-_PROCEDURES = {"STATIC", "DYNAMIC", "VISCO"}
+_PROCEDURES = {
+    *("STATIC", "DYNAMIC", "VISCO", "HEATTRANSFER"),
+    *("COUPLEDTEMPERATURE-DISPLACEMENT", "UNCOUPLEDTEMPERATURE-DISPLACEMENT"),
+}
 _OUTPUT = {"NODEFILE", "NODEOUTPUT"}
 _READ = {"BOUNDARY", "RIGIDBODY", "STEP", "ENDSTEP", *_PROCEDURES, *MATERIAL_KEYWORDS}
 
@@ -48,23 +57,26 @@ class Job:
         materials: columns by name, [c] for each block: `young`, `poisson`, and `yield_stress` if something is plastic.
             Empty if some element has no isotropic elastic material.
         ends: the times at which the steps end.
+        starts_with: what is there at rest beside a temperature, such as STRESS; see *INITIAL CONDITIONS.
     """
 
     mesh: SourceMesh
     node_type: np.ndarray
     materials: dict[str, list[np.ndarray]]
     ends: tuple[float, ...]
+    starts_with: tuple[str, ...] = ()
 
 
 @dataclass(eq=False)
 class _Conditions:
     """Which directions of which points [n, 6] are prescribed now, in some step, and in all; which points [n] are
-    prescribed to move, or belong to a rigid body that is prescribed."""
+    prescribed to move or to turn, or belong to a rigid body that is prescribed."""
 
     now: np.ndarray
     sometimes: np.ndarray
     always: np.ndarray
     moved: np.ndarray
+    turned: np.ndarray
     rigid: np.ndarray
     notes: list[str] = field(default_factory=list)
 
@@ -93,15 +105,23 @@ def read_job(path: Path) -> Job:
     conditions = _conditions(deck, mesh)
     materials, more = material_columns(deck)
     mesh.notes.extend([*conditions.notes, *more, *_not_in_a_scene(deck)])
-    return Job(mesh, _node_type(mesh, conditions), materials, _ends(deck))
+    starts_with = [_initial(keyword) for keyword in deck.keywords if keyword.name == "INITIALCONDITIONS"]
+    return Job(mesh, _node_type(mesh, conditions), materials, _ends(deck), tuple(starts_with))
+
+
+def _initial(keyword: Keyword) -> str:
+    """What *INITIAL CONDITIONS gives: STRESS, PLASTICSTRAIN, TEMPERATURE and others."""
+    return keyword.options.get("TYPE", "").replace(" ", "").upper()
 
 
 def _require_plain_results(deck: Deck) -> None:
-    """Check that displacements are written along x, y and z, and from rest."""
+    """Check that displacements are written along x, y and z, and from rest, and that no element comes or goes."""
     turned = any(keyword.name == "TRANSFORM" for keyword in deck.keywords)
     for keyword in deck.keywords:
         if turned and keyword.name in _OUTPUT and keyword.options.get("GLOBAL", "").upper() == "NO":
             raise keyword.error("GLOBAL=NO writes displacements along the axes of *TRANSFORM: leave it out")
+        if keyword.name == "MODELCHANGE" and "CONTACT" not in keyword.options.get("TYPE", "").upper():
+            raise keyword.error("elements come or go during the job, but all frames of a scene have the same ones")
         if keyword.name == "STEP" and "PERTURBATION" in keyword.options:
             raise keyword.error(
                 "PERTURBATION gives displacements from the step before, which are no frames of a motion"
@@ -111,7 +131,7 @@ def _require_plain_results(deck: Deck) -> None:
 def _conditions(deck: Deck, mesh: SourceMesh) -> _Conditions:
     shape = (len(mesh.points), _DIRECTIONS)
     free = np.zeros(shape, bool)
-    state = _Conditions(free.copy(), free.copy(), np.ones(shape, bool), free[:, 0].copy(), free[:, 0].copy())
+    state = _Conditions(free.copy(), free.copy(), np.ones(shape, bool), *(free[:, 0].copy() for _ in range(3)))
     groups = {name.upper(): nodes for name, nodes in mesh.groups.items()}
     renewed = False
     for keyword in deck.keywords:
@@ -150,8 +170,8 @@ def _prescribe(
         raise DatasetError(f"{line.place}: holds the directions {lowest} to {highest}; the first is 1")
     for direction in range(lowest, min(highest, _DIRECTIONS) + 1):
         state.now[rows, direction - 1] = True
-    if lowest <= 3 and real(value, line) != 0:
-        state.moved[rows] = True
+    if real(value, line) != 0 or keyword.options.keys() & _FROM_ELSEWHERE:
+        (state.moved if lowest <= 3 else state.turned)[rows] = True
 
 
 def _rows(keyword: Keyword, target: str, mesh: SourceMesh, groups: dict[str, np.ndarray]) -> np.ndarray:
@@ -171,10 +191,13 @@ def _rigid_body(keyword: Keyword, state: _Conditions, mesh: SourceMesh, groups: 
     reference = keyword.required("REFNODE")
     at = _rows(keyword, reference, mesh, groups)
     turns = state.sometimes[at, 3:].any(axis=0)
+    is_turned = state.turned[at].any()
     if "ROTNODE" in keyword.options:
-        turns |= state.sometimes[_rows(keyword, keyword.options["ROTNODE"], mesh, groups), :3].any(axis=0)
+        turning = _rows(keyword, keyword.options["ROTNODE"], mesh, groups)
+        turns |= state.sometimes[turning, :3].any(axis=0)
+        is_turned |= state.moved[turning].any()
     shifts = state.sometimes[at, :3].any(axis=0)
-    if not shifts.any():
+    if not shifts.any() and not is_turned:
         state.notes.append(f"the rigid body {name} is prescribed nowhere: its nodes count as free")
         return
     state.rigid[nodes] = True
@@ -189,7 +212,9 @@ def _rigid_body(keyword: Keyword, state: _Conditions, mesh: SourceMesh, groups: 
 def _node_type(mesh: SourceMesh, conditions: _Conditions) -> np.ndarray:
     """[n] uint8: see `read_job`. For a whole body the nodes count that a scene keeps: the corners, and the middles of
     the edges of tetrahedra."""
-    held = conditions.sometimes[:, :3]
+    held = conditions.sometimes[:, :3].copy()
+    if all(block.label.startswith(_PLANE) for block in mesh.blocks):
+        held[:, 2] |= held[:, :2].any(axis=1)
     prescribed = held.all(axis=1) | conditions.moved | conditions.rigid
     kept = np.zeros(len(mesh.points), bool)
     pairs = [np.zeros((0, 2), np.int64)]
@@ -211,14 +236,17 @@ def _node_type(mesh: SourceMesh, conditions: _Conditions) -> np.ndarray:
 
 
 def _ends(deck: Deck) -> tuple[float, ...]:
-    """The sums of the periods of the steps, which stand second in the data line of *STATIC or *DYNAMIC, else 1."""
+    """The sums of the periods of the steps, which stand second in the data line of *STATIC or *DYNAMIC, else 1. A step
+    may begin at a time of its own."""
     ends: list[float] = []
     for keyword in deck.keywords:
         if keyword.name in _PROCEDURES:
             line = keyword.data[0] if keyword.data else None
             entries = tokens(line) if line is not None else []
             period = real(entries[1], line) if line is not None and len(entries) > 1 and entries[1] else 1.0
-            ends.append(period + (ends[-1] if ends else 0.0))
+            start = keyword.options.get("TOTALTIMEATSTART")
+            before = real(start, keyword.line) if start else ends[-1] if ends else 0.0
+            ends.append(period + before)
     return tuple(ends)
 
 

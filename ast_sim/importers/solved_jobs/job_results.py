@@ -26,6 +26,9 @@ _IN_RESULTS = {"PEEQ": "PE", "RF": "FORC", "NT": "NDTEMP"}
 # A field that is not zero at rest.
 _TEMPERATURE = "NDTEMP"
 
+# What *INITIAL CONDITIONS of these types make of fields at rest: they are not 0.
+_AT_REST = {"STRESS": ("von_mises", "STRESS"), "PLASTICSTRAIN": ("PE",), "HARDENING": ("PE",)}
+
 
 def job_frames(job: Job, results: Path, pascals: float, wanted: Sequence[str] = ()) -> Iterator[SourceMesh]:
     """The frames of a job, the first at rest; fields `displacement`, `von_mises` if there are stresses, `node_type`,
@@ -51,6 +54,7 @@ def job_frames(job: Job, results: Path, pascals: float, wanted: Sequence[str] = 
         if last is None and frame.time:
             if any(_IN_RESULTS.get(name, name) == _TEMPERATURE for name in wanted):
                 raise DatasetError(f"{results}: holds no frame at rest, so the temperature there is not known")
+            _require_zero_at_rest(job, results, {_IN_RESULTS.get(name, name) for name in fields})
             rest = {name: values if name == "node_type" else np.zeros_like(values) for name, values in fields.items()}
             told = [*mesh.notes, "a frame at rest stands before the results"]
             yield replace(mesh, point_fields=rest, time=0.0, notes=told)
@@ -61,6 +65,17 @@ def job_frames(job: Job, results: Path, pascals: float, wanted: Sequence[str] = 
             f"{results}: ends at the time {last:g}, but the steps of {job.mesh.path.name} end at {job.ends[-1]:g}: the"
             " job was not solved to its end, or its last increment was not written"
         )
+
+
+def _require_zero_at_rest(job: Job, results: Path, fields: set[str]) -> None:
+    """Raise DatasetError if *INITIAL CONDITIONS give one of the fields, which is taken for 0 at rest."""
+    for kind in job.starts_with:
+        known = fields.intersection(_AT_REST.get(kind, ()))
+        if known:
+            raise DatasetError(
+                f"{results}: *INITIAL CONDITIONS of {job.mesh.path.name} give {kind}, so {min(known)} at rest is not 0"
+                " and not in the results: leave the field out of the results (*EL FILE), or the conditions out"
+            )
 
 
 def _fields(job: Job, frame: SourceMesh, wanted: Sequence[str]) -> dict[str, np.ndarray]:

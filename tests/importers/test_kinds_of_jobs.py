@@ -1,0 +1,148 @@
+"""Jobs of CalculiX whose nodes are moved, whose steps end or whose rest is other than in the common ones."""
+
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from blocks import block
+from test_jobs import solved
+
+from ast_sim.importers.series import FieldNames, read_series
+from ast_sim.scene import NodeType
+from ast_sim.support.errors import DatasetError
+
+CUBE = block(2, 2, 2)
+HEIGHT = CUBE.rest_position[:, 2]
+NAMES = FieldNames(stress_unit="MPa")
+HEAT = ["*CONDUCTIVITY", "50.", "*SPECIFIC HEAT", "4e8", "*DENSITY", "7e-9"]
+TURNED = ["*NODE", "998, 1, 1, 2", "999, 1, 1, 2", "*RIGID BODY, NSET=TOP, REF NODE=998, ROT NODE=999"]
+
+
+def listed(name, chosen):
+    return [f"*NSET, NSET={name}", *(str(1 + node) for node in np.flatnonzero(chosen))]
+
+
+def step(*lines, procedure="*STATIC", output=("S",)):
+    head = ["*STEP, NLGEOM", procedure, "0.5, 1.", *lines]
+    return [*head, "*NODE FILE", "U", "*EL FILE", ",".join(output), "*END STEP"]
+
+
+def cube(*steps, model=(), material=()):
+    """A cube whose floor is held."""
+    nodes = [f"{n}, {x:g}, {y:g}, {z:g}" for n, (x, y, z) in enumerate(CUBE.rest_position, 1)]
+    elements = [", ".join(map(str, [n, *(row + 1)])) for n, row in enumerate(CUBE.elements, 1)]
+    lines = ["*NODE, NSET=EACH", *nodes, "*ELEMENT, TYPE=C3D4, ELSET=ALL", *elements]
+    lines += [*listed("FLOOR", HEIGHT == 0), *listed("TOP", HEIGHT == 2)]
+    lines += ["*MATERIAL, NAME=M", "*ELASTIC", "1000., 0.3", *material, "*SOLID SECTION, ELSET=ALL, MATERIAL=M"]
+    return [*lines, *model, "*BOUNDARY", "FLOOR, 1, 3", *(line for one in steps for line in one)]
+
+
+def moved(z, kind=""):
+    return [f"*BOUNDARY{kind}", "TOP, 1, 2", f"TOP, 3, 3, {z}"]
+
+
+def read(job, names=NAMES):
+    return read_series(job[1], names, deck=job[0])
+
+
+def test_values_of_a_global_model_move_nodes(tmp_path):
+    whole = read(solved(tmp_path / "whole", cube(step(*moved(-0.1)))))
+    (tmp_path / "part").mkdir()
+    shutil.copy(tmp_path / "whole" / "job.frd", tmp_path / "part" / "global.frd")
+    model = ["*SUBMODEL, TYPE=NODE, INPUT=global.frd", "TOP"]
+    driven = step("*BOUNDARY, SUBMODEL, STEP=1", "TOP, 3, 3")
+    part = read(solved(tmp_path / "part", cube(driven, model=model)))
+    assert np.array_equal(part.scene.node_type == NodeType.HANDLE, (HEIGHT == 0) | (HEIGHT == 2))
+    np.testing.assert_allclose(part.position[:, HEIGHT == 2, 2], whole.position[:, HEIGHT == 2, 2], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("boundary", "driven"),
+    [(["999, 3, 3, 0.2"], True), (["998, 4, 6", "999, 1, 3"], False), (["998, 3, 3, -0.1", "999, 1, 3"], True)],
+    ids=["turned", "turns held, pushed by a load", "moved"],
+)
+def test_a_rigid_body_that_is_only_turned_is_prescribed(tmp_path, boundary, driven):
+    load = [] if driven else ["*CLOAD", "998, 3, -5."]
+    result = read(solved(tmp_path, cube(step("*BOUNDARY", *boundary, *load), model=TURNED)))
+    top = HEIGHT == 2
+    assert (result.scene.node_type[top] == (NodeType.HANDLE if driven else NodeType.NORMAL)).all()
+    assert ("the rigid body TOP is prescribed nowhere" in result.attributes["notes"]) != driven
+    turned = boundary[0].startswith("999")
+    way = result.position[-1, top] - result.scene.rest_position[top]
+    assert (np.abs(way).max() > 0.1) == (turned or driven)
+
+
+@pytest.mark.parametrize("kind", ["CPE3", "CPS3", "CAX3"])
+def test_nodes_in_a_plane_are_held_along_two_axes(tmp_path, kind):
+    places = [(x, y) for y in range(3) for x in (1, 2, 3)]
+    quads = [(1, 2, 5, 4), (2, 3, 6, 5), (4, 5, 8, 7), (5, 6, 9, 8)]
+    triangles = [half for a, b, c, d in quads for half in ((a, b, c), (a, c, d))]
+    lines = ["*NODE", *(f"{n}, {x}, {y}, 0." for n, (x, y) in enumerate(places, 1))]
+    lines += [f"*ELEMENT, TYPE={kind}, ELSET=ALL", *(f"{n}, {a}, {b}, {c}" for n, (a, b, c) in enumerate(triangles, 1))]
+    lines += ["*MATERIAL, NAME=M", "*ELASTIC", "1000., 0.3", "*SOLID SECTION, ELSET=ALL, MATERIAL=M"]
+    lines += ["*NSET, NSET=LOW", "1, 2", "*BOUNDARY", "LOW, 1, 2", "3, 2, 2", "*STEP", "*STATIC", "*BOUNDARY"]
+    lines += ["7, 2, 2, -0.1", "8, 2, 2, -0.1", "9, 2, 2, -0.1", "*NODE FILE", "U", "*EL FILE", "S", "*END STEP"]
+    result = read(solved(tmp_path, lines))
+    assert np.flatnonzero(result.scene.node_type == NodeType.HANDLE).tolist() == [0, 1, 6, 7, 8]
+    assert "1 nodes are held in some directions only" in result.attributes["notes"]  # node 3 slides
+    way = result.position[1, 6:] - result.scene.rest_position[6:]
+    np.testing.assert_allclose(way[:, 1:], [(-0.1, 0)] * 3, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("kind", "rows", "names", "cause"),
+    [
+        ("STRESS", [f"{e}, 1, 0, 0, 5., 0, 0, 0" for e in range(1, 49)], NAMES, "give STRESS, so von_mises at rest is"),
+        (
+            "PLASTIC STRAIN",
+            [f"{e}, 1, 0.01, -0.005, -0.005, 0, 0, 0" for e in range(1, 49)],
+            replace(NAMES, fields=("PEEQ",)),
+            "give PLASTICSTRAIN, so PE at rest is not 0",
+        ),
+    ],
+)
+def test_what_is_not_zero_at_rest_is_refused(tmp_path, kind, rows, names, cause):
+    model = [f"*INITIAL CONDITIONS, TYPE={kind}", *rows]
+    lines = cube(step(*moved(-0.1), output=("S", "PEEQ")), model=model, material=["*PLASTIC", "5., 0.", "6., 1."])
+    job = solved(tmp_path, lines)
+    with pytest.raises(DatasetError, match=f"job.frd: .INITIAL CONDITIONS of job.inp {cause}"):
+        read(job, names)
+    without = [line for line in lines if line not in ("*EL FILE", "S,PEEQ")]
+    assert read(solved(tmp_path / "u", without)).stress is None  # the displacement is 0 at rest all the same
+
+
+def test_elements_that_come_or_go_are_refused(tmp_path):
+    """In the second step the file of the results has all elements."""
+    gone = ["*MODEL CHANGE, TYPE=ELEMENT, REMOVE", "SOME"]
+    lines = cube(step(*moved(-0.1)), step(*gone, *moved(-0.15)), model=["*ELSET, ELSET=SOME", "1, 2, 3"])
+    with pytest.raises(DatasetError, match=r"job.inp:\d+: \*MODELCHANGE: elements come or go during the job"):
+        read(solved(tmp_path, lines))
+
+
+@pytest.mark.parametrize("procedure", ["*COUPLED TEMPERATURE-DISPLACEMENT", "*UNCOUPLED TEMPERATURE-DISPLACEMENT"])
+def test_steps_with_heat_have_an_end(tmp_path, procedure):
+    model = ["*INITIAL CONDITIONS, TYPE=TEMPERATURE", "EACH, 20."]
+    steps = [step(*moved(z), procedure=procedure) for z in (-0.1, -0.05)]
+    job = solved(tmp_path, cube(*steps, model=model, material=HEAT))
+    assert "the steps end at 1, 2;" in read(job).attributes["notes"]
+    job[0].write_text(job[0].read_text().replace("0.5, 1.\n", "0.5, 2.\n"))
+    with pytest.warns(UserWarning, match=r"ends at the time 2, but the steps of job.inp end at 4"):
+        read(job)
+
+
+def test_a_step_begins_at_a_time_of_its_own(tmp_path):
+    job = solved(tmp_path, cube(step(*moved(-0.1), procedure="*STATIC, TOTAL TIME AT START=5")))
+    result = read(job)
+    assert result.times == (0, 5.5, 6) and "the steps end at 6;" in result.attributes["notes"]
+
+
+def test_a_bolt_is_a_load(tmp_path):
+    model = ["*NODE", "900, 0, 0, 9", "*SURFACE, NAME=CUT", "1, S1", "*PRE-TENSION SECTION, SURFACE=CUT, NODE=900"]
+    job = solved(tmp_path, cube(step(*moved(-0.1))))
+    text = job[0].read_text()
+    job[0].write_text(text.replace("*STEP", "\n".join([*model, "0., 0., 1.", "*STEP"]), 1))
+    assert (
+        "loads are not part of a scene and must be equal in all of them: PRE-TENSIONSECTION"
+        in read(job).attributes["notes"]
+    )
