@@ -146,3 +146,22 @@ def test_a_bolt_is_a_load(tmp_path):
         "loads are not part of a scene and must be equal in all of them: PRE-TENSIONSECTION"
         in read(job).attributes["notes"]
     )
+
+
+@pytest.mark.parametrize(("old", "new"), [("  100CL  1", "  100CSET1"), ("  100CL  102", "  100CSET102")])
+def test_headers_that_the_reader_does_not_see_are_refused(tmp_path, old, new):
+    """It takes displacements of 0 for results that it does not see."""
+    job = solved(tmp_path, cube(step(*moved(-0.1))))
+    job[1].write_text(job[1].read_text().replace(old, new))
+    with pytest.raises(DatasetError, match="job.frd: .*the reader of .frd files does not see its results at the time"):
+        read(job)
+
+
+def test_increments_that_do_not_follow_each_other_in_time_are_refused(tmp_path):
+    """A reader that sorts them by time mixes the steps."""
+    reset = [step(*moved(z), procedure=f"*STATIC, DIRECT{kind}") for z, kind in ((-0.1, ""), (-0.2, ", TIME RESET"))]
+    reset[1][2] = "0.3, 0.9"
+    with pytest.raises(
+        DatasetError, match=r"the increment at the time 0\.\d stands after the one at 1: let the time go on"
+    ):
+        read(solved(tmp_path, cube(*reset)))

@@ -79,8 +79,8 @@ def read_frd_headers(path: Path) -> tuple[list[int], list[FrdResult]]:
     """The numbers of nodes and elements that a file declares, and its results.
 
     Raises:
-        DatasetError: the results are modes or vibrations, which are no frames of a motion, two increments have the same
-            time, or a line holds what is no number.
+        DatasetError: the results are modes or vibrations, which are no frames of a motion, the times of the increments
+            do not ascend, or a line holds what is no number.
     """
     try:
         with opened(path) as content:
@@ -109,14 +109,24 @@ def read_frd_headers(path: Path) -> tuple[list[int], list[FrdResult]]:
             f"{path}: holds {_MODES[modes]}, which are no frames of a motion: write the results of a *STATIC or"
             " *DYNAMIC step"
         )
+    _require_ascending(path, results)
+    return counts, results
+
+
+def _require_ascending(path: Path, results: list[FrdResult]) -> None:
+    """Check that increments follow each other in time: readers sort them by their times."""
     increments: dict[float, bytes] = {}
-    for result in results:
+    for before, result in zip([None, *results], results, strict=False):
         if increments.setdefault(result.time, result.increment) != result.increment:
             raise DatasetError(
                 f"{path}: two increments have the time {result.time:g}, so their results cannot be told apart: let the"
                 " time go on from step to step (no TIME RESET), and write increments that differ by more than rounding"
             )
-    return counts, results
+        if before is not None and result.time < before.time:
+            raise DatasetError(
+                f"{path}: the increment at the time {result.time:g} stands after the one at {before.time:g}: let the"
+                " time go on from step to step (no TIME RESET)"
+            )
 
 
 def _no_number(content: mmap.mmap, results: list[FrdResult]) -> str | None:

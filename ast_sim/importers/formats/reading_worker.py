@@ -170,6 +170,12 @@ def _opened(path: Path, changed: int, size: int) -> _Opened | _Results:
             warnings.simplefilter("error")  # elements that it skips
             reader = pyvista_frd.FRDReader(path)
         (declared, _), results = read_frd_headers(path)
+        unseen = [one.time for one in results if not np.isclose(reader.time_values, one.time, rtol=1e-5).any()]
+        if unseen:
+            raise Refused(
+                f"the reader of .frd files does not see its results at the time {unseen[0]:g}: their headers must be as"
+                " CalculiX writes them (100CL)"
+            )
         partial: dict[float, list[tuple[str, np.ndarray]]] = {}
         for result, nodes in partly_given(path, results, declared):
             partial.setdefault(result.time, []).append((result.name, nodes))
