@@ -304,3 +304,27 @@ def test_a_node_has_a_number_of_at_least_1(tmp_path):
     path.write_text(path.read_text().replace("\n1, 0, 0, 0\n", "\n1,\n0, 0, 0\n"))
     with pytest.raises(DatasetError, match="deck.inp:3: the number of a node is 0; must be at least 1"):
         read_mesh(path)
+
+
+@pytest.mark.parametrize(
+    ("lines", "points"),
+    [
+        (["5, 0, 0"], [(5, 0, 0), (6, 0, 0), (5, 1, 0), (5, 0, 1)]),
+        (["5, 0, 0,"], [(5, 0, 0), (6, 0, 0), (5, 1, 0), (5, 0, 1)]),
+        (["5, 0, 0, 6, 0, 0"], [(5, 0, 0), (6, 0, 0), (5, 1, 0), (5, 0, 1)]),
+        (["5, 0, 0, 5, 1, 7"], [(5, 0, 0), (5, 1, 0), (4, 0, 0), (5, 0, 1)]),
+        (["5, 0, 0, 5, 0, 1", "5, 1, 0"], [(5, 0, 0), (5, 0, 1), (5, 1, 0), (4, 0, 0)]),
+        (["0, 0, 5, 0, 0, 0"], [(0, 0, 5)]),
+    ],
+    ids=["shifted", "with a comma", "the same axes", "x projected", "two lines", "x along z"],
+)
+def test_nodes_are_given_in_a_system_of_their_own(tmp_path, lines, points):
+    """The origin alone shifts; without a second line z stays, and the x axis is projected."""
+    path = tmp_path / "a.inp"
+    nodes = ["1, 0, 0, 0", "2, 1, 0, 0", "3, 0, 1, 0", "4, 0, 0, 1"]
+    path.write_text("\n".join(["*SYSTEM", *lines, "*NODE", *nodes, "*ELEMENT, TYPE=C3D4", "1, 1, 2, 3, 4"]))
+    if len(points) == 4:
+        np.testing.assert_allclose(read_mesh(path).points, points, atol=1e-12)
+    else:
+        with pytest.raises(DatasetError, match="SYSTEM: its points lie on a line"):
+            read_mesh(path)

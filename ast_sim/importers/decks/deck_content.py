@@ -232,22 +232,24 @@ class _Reader:
         raise keyword.error(f"there is no set {text!r} before this line")
 
     def _system(self, keyword: Keyword) -> None:
+        """An origin, a point on the x axis and one in the plane of x and y. The origin alone: the axes stay; without
+        the third point z stays, and the x axis is projected onto the plane of x and y."""
         values = [real(text, line) for line in keyword.data for text in (*tokens(line), *[""] * 6)[:6]]
         if not values:
             self.system = None
             return
         if len(values) > 12:
             raise keyword.error("has more than two data lines")
-        origin, on_x = np.array(values[:3]), np.array(values[3:6])
-        on_y = np.array(values[6:9]) if len(values) > 6 else None
-        if on_y is None:  # turned about z
-            on_y = origin + np.cross([0, 0, 1], on_x - origin)
-        x = on_x - origin
-        z = np.cross(x, on_y - origin)
+        origin = np.array(values[:3])
+        alone = len(values) == 6 and len(tokens(keyword.data[0])) <= 3
+        x = np.array([1.0, 0, 0]) if alone else np.array(values[3:6]) - origin
+        if len(values) == 6:
+            x[2] = 0
+        z = np.cross(x, np.array(values[6:9]) - origin) if len(values) > 6 else np.array([0.0, 0, 1])
         axes = np.stack([x, np.cross(z, x), z])
         lengths = np.linalg.norm(axes, axis=1, keepdims=True)
         if not (lengths > 0).all():
-            raise keyword.error("its three points lie on a line")
+            raise keyword.error("its points lie on a line")
         self.system = np.concatenate([axes / lengths, origin[None]])
 
     def _part(self, keyword: Keyword) -> None:
