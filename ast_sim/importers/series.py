@@ -198,7 +198,12 @@ def _read_frames(
         kept.displacements.append(_displacement(frame, names))
         further.look(frame, cells, raw_field)
         if place != "none":
-            values = raw_field(frame, "point" if place == "node" else "cell", names.stress or "von_mises")
+            name = names.stress or "von_mises"
+            values = raw_field(frame, "point" if place == "node" else "cell", name)
+            now = order_of(frame.path, name, values.shape[1], frame.columns.get(name, ()), names.stress_order)
+            if now != order:
+                one, other = (", ".join(parts) or "one number" for parts in (now, order))
+                raise DatasetError(f"{frame.path}: {name!r} holds {one}, in the first frame {other}: write it alike")
             values = von_mises(values, order) if order else values[:, 0]
             kept.stresses.append(values if place == "node" or cells is None else values[cells])
         elif "von_mises" in {*frame.point_fields, *frame.cell_fields}:

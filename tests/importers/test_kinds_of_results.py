@@ -281,3 +281,31 @@ def test_what_meshio_misses_in_a_file_is_named(tmp_path):
         del file["ENS_MAA"]
     with pytest.raises(DatasetError, match="mesh.med: cannot be read as a mesh: meshio looks for 'ENS_MAA' in it"):
         read_mesh(path)
+
+
+SIX = ("XX", "YY", "ZZ", "XY", "YZ", "XZ")
+
+
+@pytest.mark.parametrize(
+    ("first", "last", "cause"),
+    [
+        (SIX, None, "holds one number, in the first frame xx, yy, zz, xy, yz, xz"),
+        (None, SIX, "holds xx, yy, zz, xy, yz, xz, in the first frame one number"),
+        (SIX, ("XX", "XY", "XZ", "YY", "YZ", "ZZ"), "holds xx, xy, xz, yy, yz, zz, in the first frame xx, yy, zz, xy"),
+    ],
+)
+def test_a_stress_whose_components_change_from_frame_to_frame_is_refused(tmp_path, first, last, cause):
+    for frame in range(3):
+        grid = pyvista.UnstructuredGrid(
+            {10: PAD.elements.astype(int)}, (PAD.rest_position + pressed(frame)).astype(float)
+        )
+        names = last if frame == 2 else first
+        grid.cell_data["s"] = np.full((len(PAD.elements), len(names or "1")), 100.0 * frame)
+        for column, name in enumerate(names or ()):
+            grid.GetCellData().GetArray("s").SetComponentName(column, name)
+        grid.save(tmp_path / f"f_{frame}.vtu")
+    with pytest.raises(DatasetError, match=f"f_2.vtu: 's' {cause}"):
+        read_series(tmp_path, FieldNames(stress="s", handle="0:zmin"))
+    if (first is None) != (last is None):
+        with pytest.raises(DatasetError, match=r"f_2.vtu: the field 's' has [16] components, in the first frame [61]"):
+            read_series(tmp_path, FieldNames(fields=("s",), handle="0:zmin"))

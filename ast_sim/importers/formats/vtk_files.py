@@ -29,6 +29,7 @@ from ast_sim.importers.formats.declared_sizes import (
     needed_bytes,
     stored_in_hdf,
 )
+from ast_sim.importers.formats.dyna_nodes import with_nodes
 from ast_sim.importers.formats.frd_given_up import is_left_out
 from ast_sim.importers.formats.frd_results import read_frd_headers
 from ast_sim.importers.formats.source_mesh import SourceMesh
@@ -79,6 +80,7 @@ def vtk_frames(path: Path) -> Iterator[SourceMesh]:
     while step < steps:
         head, parts = _worker.ask(path, step, budget)
         steps = head["steps"]
+        parts = with_nodes(path, parts) if is_dyna(path) else parts
         mesh = _mesh(path, parts, head["time"])
         declared = of_steps[step] if step < len(of_steps) else head.get("declared")
         declared = declared or ([sum(column) for column in zip(*pieces, strict=True)] if pieces else None)

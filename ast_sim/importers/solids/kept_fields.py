@@ -58,7 +58,13 @@ class KeptFields:
             if self.places.setdefault(key, place) != place:
                 raise DatasetError(f"{frame.path}: the field {name!r} is at each {place}, before at another place")
             values = read(frame, "point" if place == "node" else "cell", name)
-            self.frames.setdefault(key, []).append(values if place == "node" or cells is None else values[cells])
+            kept = self.frames.setdefault(key, [])
+            if kept and kept[0].shape[1] != values.shape[1]:
+                raise DatasetError(
+                    f"{frame.path}: the field {name!r} has {values.shape[1]} components, in the first frame"
+                    f" {kept[0].shape[1]}: write it alike"
+                )
+            kept.append(values if place == "node" or cells is None else values[cells])
 
     def reorder(self, order: list[int]) -> None:
         self.frames = {key: [frames[index] for index in order] for key, frames in self.frames.items()}
