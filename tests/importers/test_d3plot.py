@@ -6,6 +6,7 @@ import pytest
 from ast_sim.importers.formats.vtk_files import vtk_frames
 from ast_sim.importers.series import FieldNames, read_series
 from ast_sim.scene import NodeType
+from ast_sim.support.errors import DatasetError
 
 TIMES = (0.0, 0.5, 1.0)
 NAMES = FieldNames(displacement="Deflection", stress="Stress", handle="0:zmin")
@@ -118,3 +119,43 @@ def test_a_tool_of_shells_is_an_obstacle(tmp_path):
     front = read.scene.rest_position[:, 2] == 4.5
     assert front.sum() == 9 and (read.scene.node_type[front] == NodeType.OBSTACLE).all()
     np.testing.assert_allclose(read.position[:, front, 2], [[4.5] * 9, [4.1] * 9, [3.7] * 9], rtol=1e-6)
+
+
+def in_two_files(path):
+    """The last of three states in a file of its own."""
+    words = np.fromfile(path.parent / "d3plot01", "<f4")
+    end = words[-1:]
+    size = (len(words) - 1) // 3
+    np.concatenate([words[: 2 * size], end, np.zeros(50)]).astype("<f4").tofile(path.parent / "d3plot01")
+    np.concatenate([words[2 * size : -1], end]).astype("<f4").tofile(path.parent / "d3plot02")
+
+
+@pytest.mark.parametrize(
+    ("damage", "cause"),
+    [
+        (lambda path: None, None),
+        (lambda path: (path.parent / "d3plot02").rename(path.parent / "d3plot03"), "d3plot02 is missing, but d3plot03"),
+        (lambda path: (path.parent / "d3plot01").unlink(), "d3plot01 is missing, but d3plot02 is there"),
+        (lambda path: (path.parent / "d3plotaa").touch(), "goes on in d3plotaa with another mesh"),
+        (
+            lambda path: shorten(path.parent / "d3plot02"),
+            "d3plot02: is cut off: it does not end as the files",
+        ),
+        (lambda path: shorten(path.parent / "d3plot01"), "d3plot01: is cut off"),
+    ],
+    ids=["whole", "one missing", "the first missing", "adaptive", "cut off", "the first cut off"],
+)
+def test_states_that_are_missing_or_cut_off_are_refused(tmp_path, damage, cause):
+    """VTK stops at the first missing file, and takes zeros for the rest of a state that is cut off."""
+    path = write(tmp_path, COLUMN, CUBES, [1, 1, 1, 1], pressed(COLUMN), stresses(4))
+    in_two_files(path)
+    damage(path)
+    if cause is None:
+        assert read_series(path, NAMES).times == TIMES
+        return
+    with pytest.raises(DatasetError, match=cause):
+        read_series(path, NAMES)
+
+
+def shorten(file):
+    file.write_bytes(file.read_bytes()[:-240])

@@ -29,7 +29,7 @@ from ast_sim.importers.formats.declared_sizes import (
     needed_bytes,
     stored_in_hdf,
 )
-from ast_sim.importers.formats.dyna_nodes import with_nodes
+from ast_sim.importers.formats.dyna_files import require_whole, with_nodes
 from ast_sim.importers.formats.frd_given_up import is_left_out
 from ast_sim.importers.formats.frd_results import read_frd_headers
 from ast_sim.importers.formats.source_mesh import SourceMesh
@@ -137,6 +137,7 @@ def _checked(path: Path) -> tuple[list[tuple[int, int]], int]:
         (nodes, elements), _ = read_frd_headers(path)
         return [(nodes, elements)], _OWN_BYTES + _LARGEST_RATIO * size
     if is_dyna(path):
+        require_whole(path)
         size = sum(part.stat().st_size for part in path.parent.glob(f"{path.name}*"))
     return [], _OWN_BYTES + _LARGEST_RATIO * size
 

@@ -1,4 +1,4 @@
-"""Which nodes of a d3plot file the points of each part are.
+"""What VTK does not say of d3plot files: which nodes the points of each part are, and whether the files are whole.
 
 VTK gives each part points of its own, and reads the numbers that users gave to nodes with a wrong width. Two parts of
 one body share nodes; two bodies that touch do not: without the numbers both look alike. So the nodes of each part are
@@ -9,10 +9,13 @@ Source: LS-DYNA Database Binary Output Files (Livermore Software Technology), ch
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+
+from ast_sim.support.errors import DatasetError
 
 _CONTROL = 64  # words; the numbers of the words that are used here:
 _FILE_TYPE, _DIMENSION, _NODES, _SOLIDS, _BEAMS, _SHELLS, _THICK, _EXTRA = 11, 15, 16, 23, 28, 31, 40, 57
@@ -20,6 +23,28 @@ _PLAIN = 4  # of the dimension: coordinates in space, numbers not packed
 _WITH_MATERIALS = 5  # as before, but the types of the materials stand before the coordinates
 
 _FROM_USERS = ("global", "point UserID", "cell UserIds")
+
+
+# What stands behind the last state of a file; zeros may follow.
+_ENDS = tuple(np.array([-999999], kind).tobytes() for kind in ("<f4", "<f8", ">f4", ">f8"))
+
+
+def require_whole(path: Path) -> None:
+    """Check that the files with the states of a d3plot file, d3plot01 and so on, are all there and whole.
+
+    Raises:
+        DatasetError: one is missing, or cut off; or the mesh changes in further files (d3plotaa).
+    """
+    beside = {file.name.removeprefix(path.name): file for file in path.parent.glob(f"{path.name}?*")}
+    further = sorted(name for name in beside if re.fullmatch("[a-z]{2}", name))
+    if further:
+        raise DatasetError(f"{path}: goes on in {path.name}{further[0]} with another mesh; the mesh must not change")
+    states = sorted((int(name), file) for name, file in beside.items() if name.isdigit())
+    for count, (number, file) in enumerate(states, 1):
+        if number != count:
+            raise DatasetError(f"{path}: {path.name}{count:02d} is missing, but {file.name} is there: copy all files")
+        if not file.read_bytes().rstrip(b"\0").endswith(tuple(end.rstrip(b"\0") for end in _ENDS)):
+            raise DatasetError(f"{file}: is cut off: it does not end as the files of LS-DYNA do: copy it whole")
 
 
 def with_nodes(path: Path, parts: list[dict[str, np.ndarray]]) -> list[dict[str, np.ndarray]]:
