@@ -75,6 +75,24 @@ def test_sets_of_nodes_of_exodus_are_groups(tmp_path):
         np.testing.assert_allclose(read.position[2, :, 2], 0.9 * read.scene.rest_position[:, 2], rtol=1e-6)
 
 
+@pytest.mark.parametrize("lost", [8, 200, 656, 2000])
+def test_exodus_files_that_are_cut_off_are_refused(tmp_path, lost):
+    """VTK takes zeros for the numbers that are missing."""
+    path = tmp_path / "job.exo"
+    write_exodus(path, 1 + np.arange(N))
+    path.write_bytes(path.read_bytes()[:-lost])
+    with pytest.raises(DatasetError, match="job.exo: is cut off or damaged: the file is shorter than it says"):
+        read_series(path, FieldNames("displ", handle="low"))
+
+
+def test_exodus_files_that_go_on_elsewhere_are_refused(tmp_path):
+    """As Sierra and MOOSE write them after a restart or with a new mesh."""
+    for name in ("job.e", "job.e-s002"):
+        write_exodus(tmp_path / name, 1 + np.arange(N))
+    with pytest.raises(DatasetError, match="job.e: goes on in job.e-s002 with another mesh"):
+        read_series(tmp_path / "job.e", FieldNames("displ", handle="low"))
+
+
 def test_families_of_med_are_groups(tmp_path):
     """A family may belong to several groups, and a group may have several families."""
     tags = np.where(np.arange(len(PAD.elements)) < 6, -6, -7)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import base64
 import binascii
 import re
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,6 +18,7 @@ from xml.parsers import expat
 
 import h5py
 import numpy as np
+from scipy.io import netcdf_file
 
 from ast_sim.support.errors import DatasetError
 
@@ -223,6 +225,28 @@ def stored_in_hdf(path: Path, group: str) -> int:
         return sum(sizes)
 
     return _looked_at(path, total)
+
+
+def require_whole_exodus(path: Path) -> None:
+    """Check that an Exodus file of the classic NetCDF kind has the bytes that its head declares, and that results do
+    not go on in files with other meshes (job.e-s002 beside job.e).
+
+    Raises:
+        DatasetError: they do, or it is cut off: VTK takes zeros for what is missing.
+    """
+    further = sorted(path.parent.glob(f"{path.name}-s[0-9]*"))
+    if further:
+        raise DatasetError(f"{path}: goes on in {further[0].name} with another mesh; the mesh must not change")
+    with path.open("rb") as file:
+        head = file.read(8)
+    if head[:4] not in (b"CDF\1", b"CDF\2") or head[4:] == b"\xff" * 4:  # the number of records is not known
+        return
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # that numbers are still in use
+            netcdf_file(path, "r", mmap=True).close()
+    except (ValueError, TypeError, IndexError, OSError) as error:
+        raise DatasetError(f"{path}: is cut off or damaged: the file is shorter than it says: copy it whole") from error
 
 
 def declared_in_vtkhdf(path: Path) -> list[list[int]]:

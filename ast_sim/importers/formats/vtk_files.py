@@ -27,6 +27,7 @@ from ast_sim.importers.formats.declared_sizes import (
     declared_in_vtkhdf,
     declared_in_xml,
     needed_bytes,
+    require_whole_exodus,
     stored_in_hdf,
 )
 from ast_sim.importers.formats.dyna_files import require_whole, with_nodes
@@ -126,6 +127,8 @@ def _checked(path: Path) -> tuple[list[tuple[int, int]], int]:
     """The points and cells of each piece, if the file says them, and the bytes of memory that VTK may take."""
     ending = path.suffix.lower()
     size = path.stat().st_size
+    if ending in EXODUS:
+        require_whole_exodus(path)
     if ending in (".vtu", ".vtp", ".vts"):
         declared = declared_in_xml(path)
         return declared.pieces if ending != ".vts" else [], _OWN_BYTES + _COPIES * (needed_bytes(declared) + size)
