@@ -10,6 +10,7 @@ from vtkmodules.vtkCommonDataModel import vtkPartitionedDataSet, vtkPartitionedD
 from vtkmodules.vtkIOParallelXML import vtkXMLPartitionedDataSetCollectionWriter, vtkXMLPartitionedDataSetWriter
 
 from ast_sim.importers.convert import find_series
+from ast_sim.importers.formats.vtk_files import vtk_frames
 from ast_sim.importers.mesh_file import read_mesh
 from ast_sim.importers.series import FieldNames, read_series
 from ast_sim.support.errors import DatasetError
@@ -188,3 +189,30 @@ def test_offsets_of_vtkhdf_that_mix_steps_are_refused(tmp_path):
         write_vtkhdf(path, starts)
         with pytest.raises(DatasetError, match=f"a.vtkhdf: .*: {cause}: its offsets are wrong"):
             read_series(path, NAMES)
+
+
+def legacy(path, lost):
+    """A legacy file as text with the displacement u, without its last letters."""
+    rows = ["".join(f"{x:6.3f}" for x in row) for row in CUBE.rest_position]
+    cells = ["4 " + " ".join(map(str, row)) for row in CUBE.elements.tolist()]
+    lines = ["# vtk DataFile Version 3.0", "x", "ASCII", "DATASET UNSTRUCTURED_GRID", "POINTS 8 double", *rows]
+    lines += [f"CELLS {len(cells)} {5 * len(cells)}", *cells, f"CELL_TYPES {len(cells)}", *["10"] * len(cells)]
+    lines += ["POINT_DATA 8", "SCALARS u double 3", "LOOKUP_TABLE default", *rows]
+    path.write_text("\n".join([*lines, ""])[: -lost or None])
+
+
+def test_a_legacy_file_that_is_cut_off_is_refused_or_told(tmp_path):
+    """Where it ends in a number, VTK took garbage for the numbers that are missing."""
+    notes, refused = [], 0
+    for lost in range(100):
+        legacy(tmp_path / "f.vtk", lost)
+        try:
+            frame = next(vtk_frames(tmp_path / "f.vtk"))
+        except DatasetError as error:
+            refused += 1
+            assert "Error reading ascii data" in str(error)
+        else:
+            notes.append(frame.notes)
+            np.testing.assert_allclose(frame.point_fields["u"][:, :2], CUBE.rest_position[:, :2])
+    told = ["the file ends without a line end: is its last number cut off?"]
+    assert notes == [[], *[told] * 5] and refused == 94  # without the line end, and without 1 to 4 letters of 1.000

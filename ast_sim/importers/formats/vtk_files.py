@@ -72,8 +72,13 @@ def vtk_frames(path: Path) -> Iterator[SourceMesh]:
         MissingExtra: VTK is not installed.
     """
     pieces, budget = _checked(path)
+    if path.suffix.lower() == ".vtk" and _ends_in_a_number(path):
+        with _copy(path, path.read_bytes() + b"\n") as copy:
+            told = "the file ends without a line end: is its last number cut off?"
+            yield from (replace(frame, path=path, notes=[*frame.notes, told]) for frame in vtk_frames(copy))
+        return
     if pieces and pieces[0] == (0, 0) and any(pieces[1:]) and path.suffix.lower() == ".vtu":
-        with _without_empty_pieces(path) as copy:
+        with _copy(path, _without_empty_pieces(path)) as copy:
             yield from (replace(frame, path=path) for frame in vtk_frames(copy))
         return
     of_steps = declared_in_vtkhdf(path) if path.suffix.lower() == ".vtkhdf" else []
@@ -92,17 +97,29 @@ def vtk_frames(path: Path) -> Iterator[SourceMesh]:
         yield _without_ghosts(_with_pieces(mesh, pieces, _piece_names(path)))
 
 
+def _ends_in_a_number(path: Path) -> bool:
+    """Whether a legacy file as text ends without a space or line end: then VTK takes garbage for missing numbers."""
+    content = path.read_bytes()
+    lines = content[:512].split(b"\n")
+    return len(lines) > 2 and lines[2].strip().upper() == b"ASCII" and not content[-1:].isspace()
+
+
 @contextlib.contextmanager
-def _without_empty_pieces(path: Path) -> Iterator[Path]:
-    """A copy of a file without its pieces that have no points: VTK takes the names of all arrays from the first."""
+def _copy(path: Path, content: bytes) -> Iterator[Path]:
+    """A file of the same name with other content."""
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder) / path.name
+        copy.write_bytes(content)
+        yield copy
+
+
+def _without_empty_pieces(path: Path) -> bytes:
+    """A file without its pieces that have no points: VTK takes the names of all arrays from the first."""
     head, mark, data = path.read_bytes().partition(b"<AppendedData")
     for piece in re.findall(rb"<Piece\b[^>]*/>|<Piece\b.*?</Piece>", head, re.DOTALL):
         if re.match(rb"<Piece\b[^>]*\bNumberOfPoints\s*=\s*[\"']\s*0+\s*[\"']", piece):
             head = head.replace(piece, b"", 1)
-    with tempfile.TemporaryDirectory() as folder:
-        copy = Path(folder) / path.name
-        copy.write_bytes(head + mark + data)
-        yield copy
+    return head + mark + data
 
 
 def _require_counts(mesh: SourceMesh, declared: list[int] | None) -> None:
