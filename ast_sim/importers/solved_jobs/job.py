@@ -131,7 +131,8 @@ def _require_plain_results(deck: Deck) -> None:
 def _conditions(deck: Deck, mesh: SourceMesh) -> _Conditions:
     shape = (len(mesh.points), _DIRECTIONS)
     free = np.zeros(shape, bool)
-    state = _Conditions(free.copy(), free.copy(), np.ones(shape, bool), *(free[:, 0].copy() for _ in range(3)))
+    moved, turned, rigid = (free[:, 0].copy() for _ in range(3))
+    state = _Conditions(free.copy(), free.copy(), np.ones(shape, bool), moved, turned, rigid)
     groups = {name.upper(): nodes for name, nodes in mesh.groups.items()}
     renewed = False
     for keyword in deck.keywords:
