@@ -43,6 +43,7 @@ _LEAST_YIELD = 1e-7
 _MOST_YIELD = 1.0
 
 _THOUSANDS = (1e-9, 1e-6, 1e-3, 1e3, 1e6, 1e9)
+_MOST_MATERIALS = 20
 _USUAL = 3  # at least as many simulations, and three quarters of all, have the usual modulus
 
 
@@ -72,9 +73,11 @@ def stiffness(trajectory: Trajectory) -> Stiffness | None:
         return None
     if scene.elements.shape[1] == 3 and not flat:  # a shell bends, and its strain is not known
         return None
-    rows = _spread_over(np.flatnonzero(scene.deforming_elements), _ELEMENTS)
+    corners = scene.elements[:, : 3 if flat else 4]
+    whole = np.abs(np.linalg.det(_edges(scene.rest_position, corners))) > 0  # a flat element has no strain
+    rows = _spread_over(np.flatnonzero(scene.deforming_elements & whole), _ELEMENTS)
     frames = _spread_over(np.arange(trajectory.num_frames), _FRAMES)
-    corners = scene.elements[rows][:, : 3 if flat else 4]
+    corners = corners[rows]
     strain, rounding = _strains(scene.rest_position, trajectory.position[frames], corners)
     at = stress[frames][:, :, 0].astype(np.float64)
     at = at[:, rows] if trajectory.stress_at == "element" else at[:, corners].mean(axis=2)
@@ -135,13 +138,14 @@ class Moduli(NamedTuple):
 
 
 def moduli(trajectory: Trajectory) -> Moduli:
-    """The moduli of the elements that deform; none if no column says them."""
+    """The moduli of the elements that deform; none if no column says them, or if they are too many for materials."""
     material = trajectory.scene.material
     columns = _columns(trajectory)
     if material is None or YOUNG not in columns or POISSON not in columns:
         return Moduli(())
     rows = material[trajectory.scene.deforming_elements][:, [columns.index(YOUNG), columns.index(POISSON)]]
-    return Moduli(tuple(map(tuple, np.unique(rows, axis=0).tolist())))
+    pairs = np.unique(rows, axis=0)
+    return Moduli(tuple(map(tuple, pairs.tolist())) if len(pairs) <= _MOST_MATERIALS else ())
 
 
 def other_moduli(known: Sequence[tuple[str, Moduli]]) -> list[tuple[str, Finding]]:
@@ -187,15 +191,19 @@ def _spread_over(rows: np.ndarray, most: int) -> np.ndarray:
 def _strains(rest: np.ndarray, position: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, float]:
     """The equivalent logarithmic strain [S, E] of elements by their corners [E, k], which no turn changes, and how
     large rounding makes it."""
-    count = corners.shape[1] - 1  # 2 in the plane z = constant
-    edges = np.diff(rest[corners].astype(np.float64), axis=1)[..., :count]
-    now = np.diff(position[:, corners].astype(np.float64), axis=2)[..., :count]
+    edges = _edges(rest, corners)
+    now = _edges(position, corners)
     gradient = np.linalg.solve(edges[None], now)  # transposed, which does not change its singular values
     stretch = np.linalg.svd(gradient, compute_uv=False)
     log = np.log(np.maximum(stretch, 1e-3))
-    if count == 2:
+    if log.shape[-1] == 2:
         log = np.concatenate([log, np.zeros((*log.shape[:-1], 1))], axis=-1)  # plane strain
     deviator = log - log.mean(axis=-1, keepdims=True)
     shortest = np.linalg.norm(edges, axis=2).min(axis=1).mean() if len(edges) else 1.0
     rounding = float(np.finfo(np.float32).eps * max(np.abs(position).max(), np.abs(rest).max()) / shortest)
     return np.sqrt(2 / 3 * (deviator**2).sum(axis=-1)), rounding
+
+
+def _edges(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """[..., E, d, d]: the vectors between the corners [E, d + 1]; d is 2 in a plane z = constant."""
+    return np.diff(points[..., corners, :].astype(np.float64), axis=-2)[..., : corners.shape[1] - 1]

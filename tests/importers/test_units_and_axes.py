@@ -69,6 +69,18 @@ def test_the_modulus_alone_in_another_unit_is_told_by_the_stress():
     assert told(simulations) == [(3, MODULUS)]
 
 
+def test_flat_elements_and_graded_materials_stop_nothing():
+    """A dataset that was made otherwise may hold them."""
+    simulations = several(material=STEEL)
+    rest = simulations[0].scene.rest_position.copy()
+    rest[simulations[0].scene.elements[0]] = rest[simulations[0].scene.elements[0][0]]
+    simulations[0] = replace(simulations[0], scene=replace(simulations[0].scene, rest_position=rest))
+    graded = np.linspace(1, 2, simulations[1].scene.num_elements)[:, None] ** (1, 0)
+    simulations[1] = with_moduli(with_stress(simulations[1], 1.4), graded)
+    simulations[2] = with_stress(simulations[2], 1e-6)
+    assert told(simulations) == [(2, MODULUS)]
+
+
 def test_other_materials_are_other_stresses():
     """Named by the columns, or yielding; of one unit."""
     rubber, steel = (several(3, material=material) for material in ((1e6, 0.49), STEEL))
