@@ -131,11 +131,11 @@ def mesh_of_arrays(
     """What `Scene.to_meshio` returns."""
     import meshio
 
-    return meshio.Mesh(
-        position,
-        [(CELL_KINDS[elements.shape[1]], elements)],
-        point_data={"node_type": node_type, "body": body},
-        cell_data={} if material is None else {"material": [material]},
+    return meshio.Mesh(  # of copies, to which its owner can write
+        position.copy(),
+        [(CELL_KINDS[elements.shape[1]], elements.copy())],
+        point_data={"node_type": node_type.copy(), "body": body.copy()},
+        cell_data={} if material is None else {"material": [material.copy()]},
     )
 
 

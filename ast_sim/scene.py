@@ -17,6 +17,7 @@ from ast_sim.scene_summary import scene_drawing, scene_facts
 from ast_sim.support.argument_checks import require_type, several
 from ast_sim.support.errors import DatasetError
 from ast_sim.support.notebook_table import html_table, one_line
+from ast_sim.support.read_only_arrays import ReadOnlyArrays
 
 if TYPE_CHECKING:
     import meshio
@@ -25,8 +26,8 @@ AttributeValue = str | int | float | list[float]
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
-    """The static part of a simulation with N nodes and E elements.
+class Scene(ReadOnlyArrays):
+    """The static part of a simulation with N nodes and E elements. Its arrays are read-only.
 
     Attributes:
         rest_position: [N, 3] float32, the undeformed positions; in 2-D scenes z = 0.

@@ -1,5 +1,7 @@
 """Scenes and trajectories: geometry by hand, and checks that name what is wrong."""
 
+import copy
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -163,3 +165,36 @@ def test_a_body_is_rigid_if_all_its_nodes_are_obstacles():
     assert scene.rigid_bodies == {1}
     assert scene.rigid_elements.tolist() == [False, True, False, False]
     assert scene.deforming_elements.tolist() == [True, False, False, True]
+
+
+POINTS = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
+ARRAYS = ("rest_position", "elements", "node_type", "body", "material")
+
+
+def test_nobody_writes_to_the_arrays_from_which_edges_and_surface_follow():
+    given = [np.array(POINTS, np.float32), np.array([[0, 1, 2, 3]], np.int32), np.zeros(4, np.uint8)]
+    given += [np.zeros(4, np.int32), np.ones((1, 2), np.float32)]
+    scene = Scene(*given)
+    edges, surface, kept = scene.edges(), scene.surface(), [getattr(scene, name).copy() for name in ARRAYS]
+    for array in given:
+        array[:] = array[::-1] + 1  # the caller's own array is not the scene's
+    for made in (scene, copy.copy(scene), copy.deepcopy(scene), pickle.loads(pickle.dumps(scene))):
+        for name, before in zip(ARRAYS, kept, strict=True):
+            np.testing.assert_array_equal(getattr(made, name), before)
+            with pytest.raises(ValueError, match="read-only"):
+                getattr(made, name)[:] = 0
+        np.testing.assert_array_equal(made.edges(), edges)
+        np.testing.assert_array_equal(made.surface(), surface)
+    flat = Scene.of([[0, 0], [1, 0], [0, 1]], [[0, 1, 2]])
+    with pytest.raises(ValueError, match="read-only"):
+        flat.surface()[:] = 0
+    mesh = scene.to_meshio()
+    mesh.points[:] = 7
+    mesh.cells[0].data[:] = 0
+    np.testing.assert_array_equal(scene.rest_position, kept[0])
+
+
+def test_a_scene_is_not_copied_again():
+    scene = Scene.of(POINTS, [[0, 1, 2, 3]])
+    assert all(getattr(copy.copy(scene), name) is getattr(scene, name) for name in ARRAYS)
+    assert replace(scene, material=None).elements is scene.elements

@@ -247,7 +247,10 @@ def test_the_fingerprint_tells_any_number_from_another(tmp_path):
         members["test"][0].stress[1, 2, 0] += 1
 
     def node_type(members):
-        members["train"][1].scene.node_type[0] = 3 - members["train"][1].scene.node_type[0]
+        scene = members["train"][1].scene
+        types = scene.node_type.copy()
+        types[0] = 3 - types[0]
+        members["train"][1] = replace(members["train"][1], scene=replace(scene, node_type=types))
 
     found = [fingerprint("a.h5"), fingerprint("b.h5", stress), fingerprint("c.h5", node_type)]
     assert len(set(found)) == 3 and found[0] == fingerprint("d.h5")

@@ -690,7 +690,9 @@ def test_a_changed_dataset_is_not_gone_on_with(linear, tmp_path, part):
         elif part == "valid" and split == "valid":
             trajectory.position[3, 10, 2] += 0.001
         elif part == "node_type" and split == "train":
-            trajectory.scene.node_type[0] = NodeType.NORMAL
+            types = trajectory.scene.node_type.copy()
+            types[0] = NodeType.NORMAL
+            return dataclasses.replace(trajectory, scene=dataclasses.replace(trajectory.scene, node_type=types))
         return trajectory
 
     path = toy.write(tmp_path / "toy.h5")

@@ -160,7 +160,9 @@ def test_figures_tell_solutions_apart():
         attributes = {"reaction": [0.0, 7 * factor]}
         return trajectory.Trajectory(case.scene, position, factor * stress, attributes=attributes)
 
-    case.scene.node_type[0] = NodeType.NORMAL
+    types = case.scene.node_type.copy()
+    types[0] = NodeType.NORMAL
+    case = replace(case, scene=replace(case.scene, node_type=types))
     same = compare(case, solution(1.0), solution(1.0))
     assert same == {
         "frames": 2,
