@@ -18,7 +18,7 @@ from ast_sim.number_arrays import (
     require_nodes,
     whole_numbers,
 )
-from ast_sim.support.argument_checks import in_short, several
+from ast_sim.support.argument_checks import in_short, require_line, several
 from ast_sim.support.errors import ConfigError, DatasetError
 
 if TYPE_CHECKING:
@@ -44,6 +44,7 @@ def scene_arrays(
     handles: Any,
 ) -> dict[str, Any]:
     """The arrays of a scene by name; arguments and errors are as in `Scene.of`."""
+    require_line("name", name)
     position = real_numbers(name, "points", points)
     if position.ndim == 2 and position.shape[1] == 2:
         position = np.pad(position, ((0, 0), (0, 1)))

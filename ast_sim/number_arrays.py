@@ -11,7 +11,7 @@ import numpy as np
 
 from ast_sim.support.argument_checks import in_short, several
 from ast_sim.support.errors import ConfigError, DatasetError
-from ast_sim.support.toml_settings import whole
+from ast_sim.support.toml_settings import required_whole
 
 # Elements from which the search for connected parts makes pairs of nodes at a time. This limits its memory.
 _ELEMENTS_AT_ONCE = 1 << 13
@@ -98,7 +98,7 @@ def nodes_of_body(body: np.ndarray, number: int) -> np.ndarray:
     Raises:
         ConfigError: it is no whole number, or there is no such body; the text names the existing bodies.
     """
-    (number,) = whole(body=number)
+    (number,) = required_whole(body=number)
     nodes = body == number
     if not nodes.any():
         numbers, counts = np.unique(body, return_counts=True)
@@ -144,7 +144,7 @@ def ascending(name: str, numbers: Any) -> list[int]:
     Raises:
         ConfigError: one is no whole number, or there is none; the text names the argument `name`.
     """
-    chosen = {whole(**{name: number})[0] for number in several(name, numbers, "whole numbers")}
+    chosen = {required_whole(**{name: number})[0] for number in several(name, numbers, "whole numbers")}
     if not chosen:
         raise ConfigError(f"{name} is empty: name at least one")
     return sorted(chosen)

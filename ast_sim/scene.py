@@ -17,7 +17,7 @@ from ast_sim.scene_summary import scene_drawing, scene_facts
 from ast_sim.support.argument_checks import require_type, several
 from ast_sim.support.errors import DatasetError
 from ast_sim.support.notebook_table import html_table, one_line
-from ast_sim.support.read_only_arrays import ReadOnlyArrays
+from ast_sim.support.read_only_arrays import ReadOnlyArrays, kept
 
 if TYPE_CHECKING:
     import meshio
@@ -201,7 +201,7 @@ class Scene(ReadOnlyArrays):
     @cached_property
     def rest_volumes(self) -> np.ndarray:
         """[E] float64: the volumes between the corners of the tetrahedra at rest, negative if they are inside out."""
-        return signed_volumes(self.rest_position, self.elements)
+        return kept(signed_volumes(self.rest_position, self.elements))
 
     def surface(self) -> np.ndarray:
         """[F, 3] int32: the triangles of the surface.

@@ -185,6 +185,8 @@ def test_nobody_writes_to_the_arrays_from_which_edges_and_surface_follow():
                 getattr(made, name)[:] = 0
         np.testing.assert_array_equal(made.edges(), edges)
         np.testing.assert_array_equal(made.surface(), surface)
+    with pytest.raises(ValueError, match="read-only"):
+        scene.rest_volumes[:] = 0
     flat = Scene.of([[0, 0], [1, 0], [0, 1]], [[0, 1, 2]])
     with pytest.raises(ValueError, match="read-only"):
         flat.surface()[:] = 0

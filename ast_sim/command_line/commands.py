@@ -219,14 +219,15 @@ def predict(args: argparse.Namespace) -> None:
         _predict_spec(run, args, wanted)
         return
     refuse(args, args.of_spec, f"{args.scene}, which is no specification")
+    shown = printable(str(args.scene))
     if args.scene.suffix == ".h5":
         refuse(args, args.of_mesh, f"{args.scene}, which is a dataset")
         truth = _truth(run, args)
-        name = f"{args.scene}: {args.split}/{args.index:06d}"
+        name = f"{shown}: {args.split}/{args.index:06d}"
     else:
         refuse(args, args.of_data, f"{args.scene}, which is a mesh")
         truth = None
-        name = str(args.scene)
+        name = shown
     if truth is not None and not moves:
         answer = run.predict(truth, num_frames=args.num_frames, name=name, **wanted)
     else:
@@ -246,7 +247,7 @@ def _predict_spec(run: Any, args: argparse.Namespace, wanted: dict[str, Any]) ->
     rows = grid(parse_settings(args.set))
     if len(rows) > 1:
         raise ConfigError("--set gives several values: ast-sim sweep predicts them all")
-    options = {"nodes": args.nodes, "num_frames": args.num_frames, "name": str(args.scene)}
+    options = {"nodes": args.nodes, "num_frames": args.num_frames, "name": printable(str(args.scene))}
     answer = run.predict(spec=args.scene, parameters=rows[0], **options, **wanted)
     _save(answer, args, None)
     units = {"travel_of_nodes": run.scope.length_unit, "reaction": "N", "largest_stress": "Pa"}

@@ -44,6 +44,8 @@ class GuardedFile:
         with self.reading("the file"):
             if self.path.is_dir():
                 raise DatasetError(f"{self.path} is a folder: name the file of a dataset")
+            if self.path.exists() and not self.path.is_file():
+                raise DatasetError(f"{self.path} is no regular file: name the file of a dataset")
             if not self.path.is_file():
                 raise DatasetError(f"{self.path}: there is no such file")
             self.size = self.path.stat().st_size

@@ -62,6 +62,7 @@ class Dataset:
 
     def __init__(self, path: str | os.PathLike[str], length_unit: str | None = None) -> None:
         self.path = file_name(path, "path")
+        self.absolute_path = self.path.absolute()  # whatever folder this process works in later
         self._file = GuardedFile(self.path)
         try:
             stored = self._file.info()
@@ -114,7 +115,7 @@ class Dataset:
 
     def __reduce__(self) -> tuple[type[Self], tuple[str, str]]:
         """Another process, such as one of a DataLoader, opens the file for itself, in whatever folder it works."""
-        return type(self), (str(self.path.absolute()), self.info.length_unit)
+        return type(self), (str(self.absolute_path), self.info.length_unit)
 
     def close(self) -> None:
         self._file.close()
@@ -305,8 +306,7 @@ class Dataset:
         key = (split, index)
         if key not in self._open:
             group = self._unverified(split, index)
-            count = len(self._file.array(group, "position"))
-            if count == 0:
+            if not (count := len(self._file.array(group, "position"))):
                 raise DatasetError(f"{self._name(split, index)}: position has no frames")
             nodes = len(self._file.array(group, "rest_position"))
             shapes = {"position": (count, nodes, 3)}

@@ -31,6 +31,7 @@ from ast_sim.scene import AttributeValue, Scene, Trajectory
 from ast_sim.support.argument_checks import file_name
 from ast_sim.support.errors import AstSimError, MissingExtra, RolloutError
 from ast_sim.support.notebook_table import html_picture, html_table, one_line
+from ast_sim.support.toml_settings import required_whole
 from ast_sim.view import export, picture
 from ast_sim.view.files import make_folder
 
@@ -160,9 +161,9 @@ class Answer:
         """The frame with this number in the motion of the question.
 
         Raises:
-            RolloutError: the answer does not have it; the text names the frames that it has.
+            ConfigError, RolloutError: it is no whole number; or the answer lacks it, and the text says what it has.
         """
-        if number not in self.frames or isinstance(number, bool):
+        if required_whole(number=number)[0] not in self.frames:
             known = ", ".join(map(str, self.frames[:20])) + (", ..." if len(self.frames) > 20 else "")
             raise RolloutError(f"{self.name}: the answer has no frame {number}; it has: {known or 'none'}", self)
         return self._frame(self.frames.index(number))
@@ -346,5 +347,4 @@ class Answer:
         elif path.suffix == ".csv":
             write_figures(path, self)
         else:
-            shown = (self.trajectory, None) if truth is None else (truth, self.trajectory)
-            export.write(path, *shown)
+            export.write(path, *((self.trajectory,) if truth is None else (truth, self.trajectory)))

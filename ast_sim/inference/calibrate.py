@@ -13,9 +13,11 @@ import numpy as np
 
 from ast_sim.dataset.reader import Dataset
 from ast_sim.inference.effort import Effort, choices
+from ast_sim.inference.predict_arguments import new_question
 from ast_sim.inference.promises.calibration import Calibration
 from ast_sim.inference.promises.familiarity import Familiarity
 from ast_sim.inference.promises.kept_errors import DISPLACEMENT, KeptErrors
+from ast_sim.inference.promises.known_weights import require_known_weights
 from ast_sim.inference.quantities.band import LEVEL, Comparison, compared
 from ast_sim.inference.quantities.relative_errors import moves
 from ast_sim.inference.trained_run import Run
@@ -60,6 +62,8 @@ def calibrate(
     require_runs(run)
     with run.open(data) as dataset:
         require_new_scenes(run, dataset, split)
+        run.folder.require_best()  # which will keep the result
+        require_known_weights(run)
         before, run.calibration = run.calibration, None  # it has no say in which scenes count
         try:
             result, left_out = _measured(run, dataset, split, progress)
@@ -112,23 +116,17 @@ def _measured(run: Run, dataset: Dataset, split: str, progress: ShowProgress) ->
     to_choose = choices(run.settings.model, run.settings.train.corrections)
     efforts = to_choose if run.effort in to_choose else (*to_choose, run.effort)
     scenes: list[_Measured] = []
-    left_out: list[str] = []
     fields = [name for name, *_ in run.settings.model.data.fields]
-    with Progress(dataset.count(split), "scenes", progress) as bar, warnings.catch_warnings():
+    names = [f"{split}/{index:06d}" for index in range(dataset.count(split))]
+    left_out = [name for index, name in enumerate(names) if not _counts(run, dataset.load(split, index, fields), name)]
+    _require_enough(len(names), len(left_out))
+    with Progress(len(names), "scenes", progress) as bar, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what they tell is counted here
-        for index in range(dataset.count(split)):
-            name = f"{split}/{index:06d}"
-            one = _measured_scene(run, dataset.load(split, index, fields), name, efforts, to_choose)
+        for index, name in enumerate(names):
+            if name not in left_out:
+                truth = dataset.load(split, index, fields)
+                scenes.append(_measured_scene(run, truth, name, efforts, to_choose))
             bar.advance(name)
-            if one is None:
-                left_out.append(name)
-            else:
-                scenes.append(one)
-    if len(scenes) < FEWEST:
-        raise ConfigError(
-            f"a band of {100 * LEVEL:g} % needs at least {FEWEST} calibration scenes, and there are {len(scenes)}: make"
-            " more with generate(..., calibration=N) (--calibration N)"
-        )
     quantiles, typical = _quantiles([one.comparisons for one in scenes])
     spacings = [one.spacing for one in scenes]
     latents = [one.latents for one in scenes if one.latents is not None]
@@ -136,6 +134,21 @@ def _measured(run: Run, dataset: Dataset, split: str, progress: ShowProgress) ->
     kept = _kept_errors(to_choose, [list(of_effort) for of_effort in zip(*(one.errors for one in scenes), strict=True)])
     reach = (min(spacings), max(spacings))
     return Calibration(len(scenes), efforts, quantiles, typical, reach, kept, familiarity), left_out
+
+
+def _counts(run: Run, truth: Trajectory, name: str) -> bool:
+    """Whether something moves in a scene, and it lies inside the training."""
+    return moves(truth) and not new_question(run.settings.model, run.scope, truth, None, None, name, None).notes
+
+
+def _require_enough(scenes: int, left_out: int) -> None:
+    """Raise ConfigError if too few of the scenes are left for a band."""
+    if scenes - left_out < FEWEST:
+        without = f", {left_out} of which lie outside the training or do not move" if left_out else ""
+        raise ConfigError(
+            f"a band of {100 * LEVEL:g} % needs at least {FEWEST} calibration scenes, and there are {scenes}{without}:"
+            " make more with generate(..., calibration=N) (--calibration N)"
+        )
 
 
 def _quantiles(
@@ -166,13 +179,9 @@ def _quantiles(
 
 def _measured_scene(
     run: Run, truth: Trajectory, name: str, efforts: Sequence[Effort], to_choose: Sequence[Effort]
-) -> _Measured | None:
-    """A calibration scene; None: nothing moves in it, or it lies outside the training."""
-    if not moves(truth):
-        return None
+) -> _Measured:
+    """A calibration scene."""
     answers = [run.predict(truth, effort=effort, throw=False, name=name, progress=False) for effort in efforts]
-    if answers[0].notes:
-        return None
     comparisons = [None if one.failure is not None else compared(one, truth) for one in answers]
     deepest = deepest_frame(truth)
     alone = [

@@ -106,6 +106,23 @@ class Effort:
                 raise ConfigError(f"newton_steps is {self.newton_steps}, but {error}") from error
 
 
+class DefaultEffort:
+    """The attribute `effort` of a run: one that the run cannot make is refused where it is set."""
+
+    def __get__(self, run: Any, owner: type | None = None) -> Any:
+        return self if run is None else vars(run)["effort"]
+
+    def __set__(self, run: Any, effort: Any) -> None:
+        vars(run)["effort"] = require_effort(effort, run.settings.model)
+
+
+def require_effort(effort: Any, config: ModelConfig) -> Effort:
+    """The effort; ConfigError, if it is none or the model cannot make it."""
+    require_type("effort", effort, Effort, "an Effort, such as ast_sim.Effort(newton_steps=1)")
+    effort.check(config)
+    return effort
+
+
 DIALS = {one.name: one.metadata["help"] for one in fields(Effort) if one.metadata}  # its numbers, and their help
 BUT_NEWTON_STEPS = [one.name for one in fields(Effort) if one.name != "newton_steps"]
 FIRST_CALL = Effort()

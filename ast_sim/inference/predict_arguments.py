@@ -15,7 +15,7 @@ from ast_sim.number_arrays import ranges, real_numbers, require_finite
 from ast_sim.prescribed_motion import Motion, RigidMotion, Vector, frames_for
 from ast_sim.runs.scope import Scope, spacing_of
 from ast_sim.scene import Scene, Trajectory
-from ast_sim.support.argument_checks import in_short, require_type, several
+from ast_sim.support.argument_checks import in_short, require_line, require_type, several
 from ast_sim.support.errors import ConfigError, DatasetError
 from ast_sim.support.toml_settings import whole
 
@@ -41,7 +41,7 @@ def new_question(
         ConfigError: the motion does not fit the scene, or the scene does not fit the model.
         DatasetError: an array has another dtype or shape, or holds numbers that are not finite.
     """
-    require_type("name", name, str, "a text")
+    require_line("name", name)
     if isinstance(scene, Trajectory):
         if not (motion is None and num_frames is None and stress is None):
             raise ConfigError(

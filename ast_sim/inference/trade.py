@@ -27,18 +27,20 @@ from ast_sim.inference.quantities.relative_errors import QUANTITIES, errors_of, 
 from ast_sim.inference.trained_run import Run
 from ast_sim.models.simulator import Simulator
 from ast_sim.simulate.jobs.fastest_solver import FINER, OWN_STOP_TEST, Outcome, solver_outcomes
-from ast_sim.support.argument_checks import file_name, require_type, several
+from ast_sim.simulate.jobs.recipe import recipe_of
+from ast_sim.support.argument_checks import file_name, in_short, require_type, several
 from ast_sim.support.disk import write_json
 from ast_sim.support.errors import ConfigError, SimulationError
 from ast_sim.support.progress import Progress, ShowProgress
 from ast_sim.support.provenance import provenance
-from ast_sim.support.toml_settings import whole
+from ast_sim.support.toml_settings import required_whole
 from ast_sim.trade_figures import Setting, Side, TradeFigures
 from ast_sim.view import trade_page
 from ast_sim.view.files import make_folder
 from ast_sim.view.page import page_name
 
 SCENES = 20
+LONGEST = 1e9  # seconds of a solver for a scene: 30 years
 MESH_SCENES = 3  # in which the mesh's own error is measured
 
 
@@ -114,22 +116,19 @@ def trade(
             above 0; or a run beside has learned from another dataset or has the name of another run.
         DatasetError: the dataset cannot be read.
     """
-    (scenes,) = whole(1, scenes=scenes)
-    positive = (
-        isinstance(solver_seconds, Real) and not isinstance(solver_seconds, bool) and 0 < solver_seconds < math.inf
-    )
-    if solver_seconds is not None and not positive:
-        raise ConfigError(f"the solver's seconds are {solver_seconds!r}; they must be a number above 0")
-    if solver_seconds is not None and made_from is not None:
-        raise ConfigError("made_from is for our solver, which solver_seconds stands for: give one of them")
+    (scenes,) = required_whole(1, scenes=scenes)
+    _require_seconds(solver_seconds, made_from)
     require_type("command", command, str, "a text")
-    require_runs(run, *several("beside", beside, "runs"))
+    beside = several("beside", beside, "runs")
+    require_runs(run, *beside)
     runs = _by_name([run, *beside])
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
         with run.open(data) as dataset:
             require_new_scenes(run, dataset, split)
+            if made_from is not None:
+                recipe_of(str(dataset.path), dataset.info, made_from)  # a wrong one would leave the solver out
             moving = (index for index in range(dataset.count(split)) if moves(dataset.load(split, index)))
             indices = list(islice(moving, scenes))
             if not indices:
@@ -139,6 +138,17 @@ def trade(
             )
     finally:
         torch.set_num_threads(threads)
+
+
+def _require_seconds(stated: float | None, made_from: str | os.PathLike[str] | None) -> None:
+    """Raise ConfigError unless the seconds of another program are a number above 0, and stand alone."""
+    positive = isinstance(stated, Real) and not isinstance(stated, bool) and 0 < stated <= LONGEST
+    if stated is not None and not positive:
+        raise ConfigError(
+            f"the solver's seconds are {in_short(stated)}; they must be a number above 0, at most {LONGEST:g}"
+        )
+    if stated is not None and made_from is not None:
+        raise ConfigError("made_from is for our solver, which solver_seconds stands for: give one of them")
 
 
 class _Scenes(NamedTuple):

@@ -16,7 +16,7 @@ from ast_sim.importers.scene_mesh import SceneMesh
 from ast_sim.inference.answer import Answer
 from ast_sim.inference.answering import doubts, in_domain
 from ast_sim.inference.assembly_questions import ask
-from ast_sim.inference.effort import Effort, EffortErrors, error_with
+from ast_sim.inference.effort import DefaultEffort, Effort, EffortErrors, error_with
 from ast_sim.inference.evaluation import SOLVER_SCENES
 from ast_sim.inference.evaluation.evaluate import evaluate
 from ast_sim.inference.evaluation.evaluated_run import Evaluation
@@ -24,6 +24,7 @@ from ast_sim.inference.predict_arguments import Motions, new_question, scenes_of
 from ast_sim.inference.predicting.question import Question, WantedFrames
 from ast_sim.inference.promises.calibration import Calibration
 from ast_sim.inference.promises.chosen_effort import ErrorLimit, chosen_effort
+from ast_sim.inference.promises.known_weights import KnownWeights, forget_other_weights
 from ast_sim.inference.sweep import Sweep, sweep
 from ast_sim.number_arrays import percent
 from ast_sim.runs import run_file
@@ -34,7 +35,7 @@ from ast_sim.support.errors import ConfigError, RolloutError, warn
 from ast_sim.support.notebook_table import html_table, one_line
 from ast_sim.support.progress import Progress, ShowProgress
 from ast_sim.support.provenance import provenance
-from ast_sim.support.toml_settings import NOTHING, whole
+from ast_sim.support.toml_settings import NOTHING, required_whole
 
 
 class Run:
@@ -57,16 +58,19 @@ class Run:
         CheckpointError: the folder holds no run, no checkpoint in it can be read, or the file is damaged.
     """
 
+    effort = DefaultEffort()
+
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = file_name(path, "path")
         self.folder = run_file.open_run(self.path)
         self.settings, self.scope = self.folder.settings, self.folder.scope
         self.model = self.folder.load_model()
-        self.step = self.folder.chosen.step
-        answers = self.folder.chosen.answers
+        _, self.step, answers = self.folder.chosen
         self.effort = Effort(**answers.get("effort", {"corrections": self.settings.train.corrections}))
         self.calibration = Calibration.of_run(self.path, answers)
-        self._errors = [EffortErrors.from_json(one) for one in answers.get("valid_by_effort", [])]
+        self.measured = [EffortErrors.from_json(one) for one in answers.get("valid_by_effort", [])]
+        self.folder.keep_place()
+        self.weights = KnownWeights(self.model)
 
     def _facts(self) -> dict[str, str]:
         error = self.expected_error(self.effort)
@@ -88,9 +92,8 @@ class Run:
     def save(self, path: str | os.PathLike[str], licence: str | None = None) -> None:
         """Write the run as one file, `NAME.ast`, that `Run("NAME.ast")` opens on any machine.
 
-        It holds the weights of the best checkpoint, the settings, the scope, the default effort, the curves of the
-        training, a model card and a licence, as a zip of plain files. The state of the optimizer and the dataset stay
-        behind: a training cannot go on from it.
+        It holds the weights, the settings, the scope, `effort`, the curves of the training, a model card and a licence,
+        as a zip of plain files. The optimizer's state and the dataset stay behind: a training cannot go on from it.
 
         Args:
             path: the file; an earlier one is replaced, whole or not at all.
@@ -99,7 +102,8 @@ class Run:
         Raises:
             CheckpointError: the name does not end in `.ast`, or the file cannot be written.
         """
-        run_file.write(file_name(path, "path"), self.folder, self.model, licence)
+        forget_other_weights(self, by_content=True)
+        run_file.write(file_name(path, "path"), self.folder, self.model, dataclasses.asdict(self.effort), licence)
 
     @property
     def info(self) -> DatasetInfo:
@@ -295,7 +299,7 @@ class Run:
     def expected_error(self, effort: Effort) -> float | None:
         """The mean relative error of the displacement that validation scenes had at their deepest frame with this
         effort; with more Newton steps than were measured, the error after the most; None: it was not measured."""
-        return error_with(effort, self._errors)
+        return error_with(effort, self.measured)
 
     def open(self, data: str | os.PathLike[str] | Dataset | None = None) -> Dataset:
         """Open a dataset, by default the training data, with lengths in the run's unit. The caller closes it. A dataset
@@ -308,10 +312,8 @@ class Run:
         """
         if data is None and self.path.is_file():
             raise ConfigError(f"{self.path} holds no dataset: name one; the run learned from {self.settings.data}")
-        if isinstance(data, Dataset):
-            path = data.path
-        else:
-            path = file_name(self.settings.data if data is None else data, "data")
+        data = self.settings.data if data is None else data
+        path = data.absolute_path if isinstance(data, Dataset) else file_name(data, "data")
         dataset = Dataset(path, self.scope.length_unit)
         try:
             self.folder.require_fit(dataset)
@@ -338,7 +340,7 @@ class Run:
             made_from: the specification or the parts of your own of which the dataset was made; the solver needs them.
             progress: as in `generate`; it counts scenes, once for all frames, once for the deepest, once solved.
         """
-        (solver_scenes,) = whole(0, solver_scenes=solver_scenes)
+        (solver_scenes,) = required_whole(0, solver_scenes=solver_scenes)
         require_type("command", command, str, "a text")
         with self.open(data) as dataset:
             steps = 2 * dataset.count(split) + min(solver_scenes, dataset.count(split))

@@ -188,6 +188,7 @@ def _counted(config: RunConfig) -> tuple[int, int, int]:
         ConfigError: they are too few for trials.
     """
     with Dataset(config.data) as dataset:
+        require_range("train.scenes", config.train.scenes, 1)
         scenes = config.train.scenes or dataset.count("train")
         valid = dataset.count("valid")
         if scenes < LEAST_SCENES:

@@ -50,6 +50,10 @@ class RunFolder:
         self.path = path
         self.metrics = Metrics(path)
 
+    def keep_place(self) -> None:
+        """From now on the folder is where it is today, in whatever folder this process works."""
+        self.path, self.metrics.path = self.path.absolute(), self.metrics.path.absolute()
+
     @cached_property
     def settings(self) -> RunConfig:
         return read_config(self.path)
@@ -110,11 +114,24 @@ class RunFolder:
         checkpoint.mark_best(self.path, validation["step"], validation["valid_rmse"], answers)
 
     def keep_calibration(self, calibration: Mapping[str, Any]) -> None:
-        """Keep what was measured of the answers of the chosen checkpoint beside it, until a better one is marked.
+        """Keep what was measured of the answers of the chosen checkpoint beside it, until a better one is marked;
+        errors are as in `require_best`."""
+        self.require_best()
+        best = checkpoint.read_best(self.path)
+        assert best is not None
+        answers = {**best.answers, "calibration": dict(calibration)}
+        checkpoint.mark_best(self.path, best.step, best.error, answers)
+        self.chosen = self.chosen._replace(answers=answers)
 
-        Raises:
-            CheckpointError: none was validated, or a training has marked a better one since this folder was read.
-        """
+    def forget_answers(self) -> None:
+        """From now on nothing is known of answers: the caller has changed the weights. The folder stays as it is."""
+        self.chosen = self.chosen._replace(answers={})
+
+    def require_best(self) -> None:
+        """Raise CheckpointError if no calibration can be kept: none was validated, a training has marked a better one
+        since this folder was read, or the folder is gone."""
+        if not self.path.is_dir():
+            raise CheckpointError(f"{self.path} is gone since it was opened: open the run where it is now")
         best = checkpoint.read_best(self.path)
         if best is None:
             raise CheckpointError(f"{self.path} has no best checkpoint yet: train it until it is validated")
@@ -123,9 +140,6 @@ class RunFolder:
                 f"{self.path} was opened at step {self.chosen.step:,}, and step {best.step:,} is better: open it again"
                 " and calibrate it when its training has ended"
             )
-        answers = {**best.answers, "calibration": dict(calibration)}
-        checkpoint.mark_best(self.path, best.step, best.error, answers)
-        self.chosen = self.chosen._replace(answers=answers)
 
     def start(self) -> dict[str, Any]:
         """What a run that starts from this one records: `run`, `step` and `sha256` of the weights."""
@@ -159,6 +173,9 @@ class RunFolder:
         ):
             if ours != theirs:
                 raise ConfigError(f"{dataset.path} has {what} {theirs}, but {self.path} was trained with {what} {ours}")
+        same_place = Path(self.settings.data) == dataset.absolute_path
+        if same_place and self.origin.get("data") not in (None, dataset.fingerprint()):
+            warn(f"{dataset.path} holds other scenes than when {self.path} was trained on it")
 
     def describe(self) -> dict[str, Any]:
         """What `ast-sim info` says of a run: its settings, the checkpoint that it starts from, its checkpoints and the

@@ -99,6 +99,9 @@ class RunFile(RunFolder):
         """Keep it in this object, and so in a file that is written of it; this file stays as it is."""
         self.chosen = self.chosen._replace(answers={**self.chosen.answers, "calibration": dict(calibration)})
 
+    def require_best(self) -> None:
+        """A file has one checkpoint, which is the best one."""
+
     def load_model(self) -> Simulator:
         model = build_model(self.settings.model)
         try:
@@ -136,9 +139,9 @@ def open_run(path: Path) -> RunFolder:
     return RunFile(path) if path.is_file() else RunFolder(path)
 
 
-def write(path: Path, run: RunFolder, model: Simulator, licence: str | None = None) -> None:
-    """Write the run as one file, whole or not at all; `licence` is the text of the licence of the weights, by default
-    the one that the run has.
+def write(path: Path, run: RunFolder, model: Simulator, effort: Mapping[str, Any], licence: str | None = None) -> None:
+    """Write the run as one file, whole or not at all, with its default effort; `licence` is the text of the licence of
+    the weights, by default the one that the run has.
 
     Raises:
         CheckpointError: the name does not end in `.ast`, or the file cannot be written.
@@ -149,6 +152,7 @@ def write(path: Path, run: RunFolder, model: Simulator, licence: str | None = No
     if licence is not None and not isinstance(licence, str):
         raise ConfigError(f"licence is {licence!r}; it must be the text of a licence")
     settings, chosen = run.settings, run.chosen
+    chosen = chosen._replace(answers={**chosen.answers, "effort": dict(effort)})
     without_path = dataclasses.replace(settings, data=Path(settings.data).name)
     facts = {
         "settings": to_values(without_path),

@@ -12,20 +12,32 @@ from ast_sim.support.errors import ConfigError
 
 
 def file_name(value: Any, name: str) -> Path:
-    """The name of a file or a folder as a path.
+    """The name of a file or a folder as a path; ~ is the home folder.
 
     Raises:
         ConfigError: it is neither a text nor a path, or it is empty; the text names the argument `name`.
     """
     if not isinstance(value, str | os.PathLike) or not os.fspath(value) or "\0" in str(value):
         raise ConfigError(f"{name} is {in_short(value)}; it must be the name of a file or a folder")
-    return Path(value)
+    return at_home(Path(value))
+
+
+def at_home(path: Path) -> Path:
+    """The path, in the home folder if it begins with ~, as a shell would have it."""
+    return path.expanduser() if path.parts[:1] == ("~",) else path
 
 
 def require_type(name: str, value: Any, types: type | tuple[type, ...], what: str) -> None:
     """Raise ConfigError unless the argument `name` is an instance of one of the types, which `what` says in words."""
     if not isinstance(value, types):
         raise ConfigError(f"{name} is {in_short(value)}; it must be {what}")
+
+
+def require_line(name: str, value: Any) -> None:
+    """Raise ConfigError unless the argument `name`, which stands in messages and titles, is one line of text."""
+    require_type(name, value, str, "a text")
+    if value.splitlines() != [value]:
+        raise ConfigError(f"{name} is {in_short(value)}; it must be one line of text")
 
 
 def several(name: str, values: Any, what: str) -> list[Any]:

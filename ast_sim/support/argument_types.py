@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
+from ast_sim.support.argument_checks import at_home
 from ast_sim.support.errors import ConfigError, printable
 
 Key = TypeVar("Key")
@@ -53,10 +54,10 @@ def add_overwrite(to: Parser) -> None:
 
 
 def path(text: str) -> Path:
-    """The name of a file or a folder."""
+    """The name of a file or a folder; ~ is the home folder, also in --out=~/x, where a shell leaves it."""
     if not text or "\0" in text:
         raise argparse.ArgumentTypeError(f"{text!r} is no name of a file or a folder")
-    return Path(text)
+    return at_home(Path(text))
 
 
 def whole_numbers(text: str) -> tuple[int, ...]:

@@ -13,6 +13,7 @@ import re
 import secrets
 import shutil
 import stat
+import tempfile
 import time
 import zlib
 from collections.abc import Callable, Iterator
@@ -59,18 +60,32 @@ def output_file(path: Path) -> Path:
     """The regular file that writing to `path` makes or replaces: where a link leads, or else `path` itself.
 
     Raises:
-        AstSimError: `path` is a folder, a device, a pipe or a socket.
-        OSError: it cannot be told what `path` is.
+        AstSimError: `path` is a folder, a device, a pipe or a socket; or no file can be made there: a long work would
+            end in vain.
     """
     try:
         mode = os.stat(path).st_mode
     except FileNotFoundError:  # or a link to a file that is not there yet
         mode = stat.S_IFREG
+    except OSError as error:
+        raise _unwritable(path, error) from error
     if stat.S_ISDIR(mode):
         raise AstSimError(f"{path} is a folder: name a file")
     if not stat.S_ISREG(mode):
         raise AstSimError(f"{path} is a device, a pipe or a socket, which a file would replace: name a regular file")
-    return Path(os.path.realpath(path)) if path.is_symlink() else path
+    real = Path(os.path.realpath(path)) if path.is_symlink() else path
+    folders = real.absolute().parents
+    if path.is_symlink():  # its folder is not made
+        folders = folders[:1]
+    try:
+        with tempfile.TemporaryFile(dir=next((one for one in folders if one.exists()), folders[0])):
+            return real
+    except OSError as error:
+        raise _unwritable(path, error) from error
+
+
+def _unwritable(path: Path, error: OSError) -> AstSimError:
+    return AstSimError(f"{path} cannot be written ({error.strerror or error}): choose another place")
 
 
 def temporary_name(path: Path) -> Path:
@@ -136,8 +151,10 @@ def write_json(path: Path, values: dict[str, Any]) -> None:
     """Write a JSON file whole or not at all; its folder is made if it is missing.
 
     Raises:
-        AstSimError: the file cannot be written.
+        AstSimError: the name does not end in .json, so another file may be meant; or the file cannot be written.
     """
+    if path.suffix != ".json":
+        raise AstSimError(f"{path}: the name of a file of figures must end in .json")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_text(path, json.dumps(values, indent=1, allow_nan=False) + "\n")

@@ -86,6 +86,12 @@ class Clock:
         return duration(seconds + validations * sum(self._validations) / len(self._validations))
 
 
+def require_progress(progress: object) -> None:
+    """Raise ConfigError unless `progress` says how progress is shown; long works check it before they begin."""
+    if not isinstance(progress, bool):
+        require_function("progress", progress, 0, 1, "", what="True, False or a function of (done, total, text)")
+
+
 class Progress:
     """Counts up to `total`; a context manager, which begins the count.
 
@@ -101,9 +107,7 @@ class Progress:
     bar_format: str | None = None  # of tqdm
 
     def __init__(self, total: int, unit: str, progress: ShowProgress, done: int = 0) -> None:
-        if not isinstance(progress, bool):
-            known = "True, False or a function of (done, total, text)"
-            require_function("progress", progress, 0, total, "", what=known)
+        require_progress(progress)
         self.total, self.unit, self.done = total, unit, done
         self.shown = progress is True
         self._call = None if isinstance(progress, bool) else progress

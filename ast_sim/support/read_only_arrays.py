@@ -8,6 +8,12 @@ from typing import Any
 import numpy as np
 
 
+def kept(array: np.ndarray) -> np.ndarray:
+    """The array, to which nobody can write from now on."""
+    array.flags.writeable = False
+    return array
+
+
 class ReadOnlyArrays:
     """Base of a frozen dataclass whose arrays nobody can write to.
 
@@ -18,9 +24,7 @@ class ReadOnlyArrays:
     def __post_init__(self) -> None:
         for name, value in _values(self).items():
             if isinstance(value, np.ndarray) and value.flags.writeable:
-                kept = value.copy()
-                kept.flags.writeable = False
-                object.__setattr__(self, name, kept)
+                object.__setattr__(self, name, kept(value.copy()))
 
     def __reduce__(self) -> tuple[type, tuple[Any, ...]]:
         return type(self), tuple(_values(self).values())

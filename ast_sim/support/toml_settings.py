@@ -96,6 +96,14 @@ def whole(least: int | None = None, /, **numbers: Any) -> list[Any]:
     return list(numbers.values())
 
 
+def required_whole(least: int | None = None, /, **numbers: Any) -> list[int]:
+    """As `whole`, for numbers that cannot be None."""
+    for name, value in numbers.items():
+        if value is None:
+            raise ConfigError(f"{name} is None; it must be a whole number")
+    return whole(least, **numbers)
+
+
 def require_range(key: str, value: float | None, least: float, most: float = LARGEST) -> None:
     """Raise ConfigError if the value is set, and is no number, below `least` or above `most`."""
     if value is not None and (isinstance(value, bool) or not isinstance(value, Real)):

@@ -68,10 +68,10 @@ def path_of(data: str | os.PathLike[str] | Dataset) -> Path:
     """
     if not isinstance(data, Dataset):
         return file_name(data, "data")
-    with Dataset(data.path) as in_own_unit:
+    with Dataset(data.absolute_path) as in_own_unit:
         if in_own_unit.info.length_unit != data.info.length_unit:
             raise DatasetError(f"{data.path} was opened in {data.info.length_unit}: open it without length_unit")
-    return data.path
+    return data.absolute_path
 
 
 def changes_of(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -34,6 +35,7 @@ class DataScales:
         planar: whether z is 0 in all scenes.
         recorded: numbers that the solver recorded with all scenes alike, by the name of the fact; see RECORDED. 0:
             it recorded none, or several.
+        room: the smallest distance of a node from the boundary of the domain.
     """
 
     displacement: float
@@ -44,6 +46,7 @@ class DataScales:
     pairs: int
     planar: bool = False
     recorded: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    room: float = math.inf
 
 
 def measure(dataset: Dataset) -> DataScales:
@@ -57,6 +60,8 @@ def measure(dataset: Dataset) -> DataScales:
     if count == 0:
         raise TrainingError(f"{dataset.path} has no trajectories to train on: the split train is empty")
     displacement, increment, lengths, nodes, constants, planar = [], [], [], [], [], True
+    center = np.array(dataset.info.domain_center)
+    room = math.inf
     for name, trajectory in dataset.spread("train", MEASURED):
         scene, position = trajectory.scene, trajectory.position
         scene.require_predictable(name)
@@ -66,6 +71,7 @@ def measure(dataset: Dataset) -> DataScales:
         lengths.append(edge_lengths(scene))
         nodes.append(scene.num_nodes)
         constants.append({key: trajectory.attributes.get(name) for key, name in RECORDED.items()})
+        room = min(room, dataset.info.domain_half_width - float(np.abs(position - center).max()))
         planar = planar and not scene.rest_position[:, 2].any() and not position[:, :, 2].any()
     return DataScales(
         displacement=rmse_pooled(displacement),
@@ -76,6 +82,7 @@ def measure(dataset: Dataset) -> DataScales:
         pairs=sum(target_counts(dataset, "train")),
         planar=planar,
         recorded=_alike(constants),
+        room=max(0.0, room),
     )
 
 

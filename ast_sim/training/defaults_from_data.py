@@ -97,6 +97,7 @@ def resolve_training(config: TrainConfig, scales: DataScales, model: ModelConfig
     """
     for key, (least, most) in _RANGES.items():
         require_range(f"train.{key}", getattr(config, key), least, most)
+    _require_within_epoch(config, scales.pairs)
     scenes = config.batch_size * config.accumulate
     epoch = math.ceil(scales.pairs / scenes)
     steps = config.steps if config.steps is not None else config.epochs * epoch
@@ -124,13 +125,34 @@ def resolve_training(config: TrainConfig, scales: DataScales, model: ModelConfig
         noise=noise,
         noise_gamma=_noise_gamma(config, model, noise),
         rollout_pool=pool,
-        shift=_shift(config, model),
+        shift=_shift(config, scales, model),
     )
     if resolved.corrections and not model.scheme.corrects:
         raise ConfigError(f"train.corrections is {resolved.corrections}; without model.jumps it must be 0")
     if resolved.decay <= resolved.warmup:
         raise ConfigError(f"train.warmup is {resolved.warmup}; it must be below train.decay = {resolved.decay}")
     return resolved
+
+
+def _require_within_epoch(config: TrainConfig, pairs: int) -> None:
+    """Raise ConfigError if more is drawn at once than an epoch has, or than the defaults draw: it would be the same
+    samples again, in a step that takes all memory or never ends; or if an axis to mirror along is named twice."""
+    usual = TrainConfig()
+    for key in ("batch_size", "statistics_pairs"):
+        most = max(pairs, getattr(usual, key))
+        if getattr(config, key) > most:
+            raise ConfigError(
+                f"train.{key} is {getattr(config, key)}, but an epoch has {pairs} samples: more would be the same ones"
+                f" again; take at most {most}"
+            )
+    most = max(1, pairs // config.batch_size)
+    if config.accumulate > most:
+        raise ConfigError(
+            f"train.accumulate is {config.accumulate}, but an epoch has {pairs} samples: a step of batches of"
+            f" {config.batch_size} would see the same ones again; take at most {most}"
+        )
+    if len(set(config.mirror)) < len(config.mirror):
+        raise ConfigError(f"train.mirror is {', '.join(config.mirror[:10])}; name each axis once")
 
 
 def _noise(config: TrainConfig, scales: DataScales, model: ModelConfig, along_rollouts: bool) -> float:
@@ -180,10 +202,15 @@ def _rollout_pool(config: TrainConfig, model: ModelConfig) -> int:
     return config.rollout_pool
 
 
-def _shift(config: TrainConfig, model: ModelConfig) -> float:
+def _shift(config: TrainConfig, scales: DataScales, model: ModelConfig) -> float:
     """The largest random shift of a scene. With half a cell's side, all positions within a cell are equally likely."""
     if config.shift is None:
         return min(model.cell_side / 2, LARGEST_SHIFT * model.data.domain_half_width)
     if not 0 <= config.shift < math.inf:
         raise ConfigError(f"train.shift is {config.shift}; it must be at least 0")
+    if config.shift > scales.room:
+        raise ConfigError(
+            f"train.shift is {config.shift:g}, but a training scene is {scales.room:.3g} from the boundary of the"
+            " domain, beyond which a model knows no place: take less than that"
+        )
     return config.shift

@@ -24,15 +24,15 @@ from ast_sim.runs.config_toml import has_config, write_config
 from ast_sim.runs.folder import RunFolder
 from ast_sim.runs.train_config import RunConfig
 from ast_sim.support.argument_checks import file_name, require_bool, require_function
-from ast_sim.support.errors import RESUME, CheckpointError, ConfigError, TrainingError
-from ast_sim.support.progress import ShowProgress
+from ast_sim.support.errors import RESUME, AstSimError, CheckpointError, ConfigError, TrainingError
+from ast_sim.support.progress import ShowProgress, require_progress
 from ast_sim.support.stop_signals import StopSignals
 from ast_sim.training.callbacks import Callback
 from ast_sim.training.configure import changes_of, configure, differences, path_of
 from ast_sim.training.data_lengths import DataScales, measure, scope_of
 from ast_sim.training.defaults_from_data import resolve
 from ast_sim.training.loop import Training, fit_statistics, sampler_of
-from ast_sim.training.parallel.launch import READY, together, usual_processes
+from ast_sim.training.parallel.launch import READY, require_cut, together, usual_processes
 from ast_sim.training.parallel.processes import Processes
 from ast_sim.training.time_budget import UNKNOWN_STEPS, steps_within
 from ast_sim.view.files import make_folder
@@ -81,6 +81,7 @@ def train(
         TrainingError, CheckpointError, KeyboardInterrupt: as in `start_training`.
     """
     require_bool(resume=resume)
+    require_progress(progress)
     if callback is not None:
         require_function("callback", callback, 0, {}, what="a function of (step, figures)")
     changes = changes_of(state, model_settings, settings)
@@ -224,13 +225,13 @@ def _held(run: Path, processes: Processes) -> Iterator[None]:
     """Within the block the run folder is there, and the leading process holds its lock. If it cannot, all processes
     raise. If the block fails before the run has settings, a folder that was made for it is removed."""
     absent = next((folder for folder in reversed([run, *run.parents]) if not folder.exists()), None)
-    make_folder(run)
     with ExitStack() as held:
         refusal = None
         try:
-            if processes.leads:
+            if processes.leads:  # alone, so that it knows whether the folder was there
+                make_folder(run)
                 held.enter_context(checkpoint.lock(run))
-        except CheckpointError as error:
+        except AstSimError as error:
             refusal = str(error)
         refusal = processes.of_leader(refusal)
         if refusal is not None:
@@ -267,8 +268,7 @@ def _process_count(folder: RunFolder, config: RunConfig | None, resume: bool) ->
 
 def _cut(config: RunConfig, processes: int) -> RunConfig:
     """The settings with the number of processes, each of which takes its part of every batch."""
-    if config.train.batch_size % processes:
-        raise ConfigError(f"train.batch_size = {config.train.batch_size} cannot be cut for {processes} processes")
+    require_cut(config, processes)
     return dataclasses.replace(config, train=dataclasses.replace(config.train, processes=processes))
 
 

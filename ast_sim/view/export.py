@@ -15,7 +15,7 @@ import numpy as np
 
 from ast_sim.element_topology import CELL_KINDS
 from ast_sim.scene import Trajectory
-from ast_sim.support.disk import output_file, replacing, temporary_name
+from ast_sim.support.disk import Disk, output_file, replacing, temporary_name
 from ast_sim.support.errors import AstSimError, is_utf8, require
 from ast_sim.view.fields import Fields, fields
 from ast_sim.view.files import explained
@@ -120,12 +120,27 @@ def _replacing_folder(folder: Path) -> Iterator[Path]:
 
 
 def _write_vtkhdf(path: Path, elements: np.ndarray, shown: Fields) -> None:
-    with replacing(path) as temporary, h5py.File(temporary, "w") as file:
+    with replacing(path) as temporary, _hdf5(temporary) as file:
         root = file.create_group("VTKHDF")
         root.attrs["Version"] = np.array([2, 0], dtype=np.int64)
         root.attrs.create("Type", b"UnstructuredGrid", dtype=h5py.string_dtype("ascii", len("UnstructuredGrid")))
         _write_mesh(root, elements, shown.position)
         _write_steps(root, shown)
+
+
+@contextlib.contextmanager
+def _hdf5(path: Path) -> Iterator[h5py.File]:
+    """A new HDF5 file. The first error of the disk is raised at the end: HDF5 itself would end the process."""
+    with contextlib.closing(Disk(path)) as disk:
+        try:
+            with h5py.File(disk, "w") as file:
+                yield file
+        except (OSError, RuntimeError, ValueError):
+            if disk.error is None:
+                raise
+        disk.sync()
+    if disk.error is not None:
+        raise disk.error
 
 
 def _write_mesh(root: h5py.Group, elements: np.ndarray, position: np.ndarray) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from ast_sim.scene import Trajectory
 from ast_sim.scene_summary import EYE, LIGHT
 from ast_sim.support.disk import replacing
-from ast_sim.support.errors import AstSimError, require
+from ast_sim.support.errors import AstSimError, printable, require
 from ast_sim.view.encode import finite_frames
 from ast_sim.view.fields import is_planar, require_same_scene, surface_owners
 from ast_sim.view.files import explained
@@ -97,7 +97,8 @@ def _panels(sides: Sequence[Trajectory], names: Sequence[str], row: int, length_
     for column, (side, name) in enumerate(zip(sides, names, strict=True)):
         axes = figure.add_axes((width * (column + 0.02), 0.18, 0.96 * width, 0.73))
         _draw(axes, view, side.position[row], color_map, values[column] / scale)
-        figure.text(width * (column + 0.5), 0.93, name, fontsize=12.5, fontweight="bold", color=INK, ha="center")
+        title = figure.text(width * (column + 0.5), 0.93, printable(name), fontsize=12.5, fontweight="bold", color=INK)
+        title.set(ha="center", parse_math=False)  # a name may hold any character
     place = figure.add_axes((0.5 - 0.4 * width, 0.125, 0.8 * width, 0.028))
     bar = figure.colorbar(color_map, cax=place, orientation="horizontal", extend="max")
     bar.set_label(f"{label} ({prefix}{unit}), frame {first.numbers[row]}", color=INK)

@@ -46,7 +46,8 @@ def write(
         _draw(axes, scene, np.where(scene.prescribed[:, None], last, scene.rest_position))
         size = np.ptp(scene.rest_position, axis=0)
         wrapped = title.replace(", ", ",\n", 1) if len(title) > 60 else title
-        axes.set_title(f"{wrapped}\n{size[0]:.4g} x {size[1]:.4g} x {size[2]:.4g} {unit}", fontsize=8, color=INK)
+        told = f"{wrapped}\n{size[0]:.4g} x {size[1]:.4g} x {size[2]:.4g} {unit}"
+        axes.set_title(told, fontsize=8, color=INK, parse_math=False)  # names of parts may hold any character
     figure.text(0.5, 0.01, "black: stands still    red: moves, and where to", ha="center", fontsize=9, color=INK)
     figure.subplots_adjust(0.01, 0.05, 0.99, 0.92, 0.03, 0.18)
     with explained(path), replacing(path) as temporary:

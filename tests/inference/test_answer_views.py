@@ -10,7 +10,7 @@ import toy
 from PIL import Image
 
 from ast_sim.inference.answer import Answer
-from ast_sim.support.errors import MissingExtra, RolloutError
+from ast_sim.support.errors import ConfigError, MissingExtra, RolloutError
 
 TRUTH = toy.plate()
 ROWS = [5, 2, 3]  # the order in which frames were asked for
@@ -44,7 +44,7 @@ def test_frames_one_by_one():
     assert answer("none").frame(2).stress is None
     with pytest.raises(RolloutError, match="toy: the answer has no frame 4; it has: 5, 2, 3"):
         found.frame(4)
-    with pytest.raises(RolloutError, match="the answer has no frame True"):
+    with pytest.raises(ConfigError, match="number is True; it must be a whole number"):
         found.frame(True)
 
 

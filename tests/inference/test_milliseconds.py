@@ -101,7 +101,7 @@ def test_what_is_no_such_number_is_refused_by_name(cache, truth, options, text):
 
 def test_a_model_without_known_errors_cannot_choose(cache, truth, tmp_path):
     run = ast_sim.example_run("plates")
-    run._errors = []
+    run.measured = []
     with pytest.raises(ConfigError, match="ms chooses among efforts whose errors are known"):
         run.predict(truth, ms=50)
 

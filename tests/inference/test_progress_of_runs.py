@@ -1,12 +1,13 @@
 """The functions of a run that may take long tell how far they are, all in the same way, and are quiet if asked."""
 
 import logging
+import shutil
 import warnings
 
 import pytest
 import toy
 
-from ast_sim import Dataset, calibrate, trade, train
+from ast_sim import Dataset, Run, calibrate, trade, train
 from ast_sim.support.errors import ConfigError
 
 
@@ -75,11 +76,15 @@ def test_evaluation_and_trade_count_scenes(trained, capfd):
     assert capfd.readouterr() == ("", "")
 
 
-def test_calibration_counts_scenes(tmp_path, trained, capfd):
+def test_calibration_counts_scenes(tmp_path, trained, capfd, monkeypatch):
     data = toy.write(tmp_path / "toy.h5", (0, 0, 19))
+    run = Run(shutil.copytree(trained[1].path, tmp_path / "run"))
     told = Told()
-    with pytest.raises(ConfigError, match="at least 19 calibration scenes"):  # only some of them are like the training
-        calibrate(trained[1], data, "test", progress=told)
+    with pytest.raises(ConfigError, match="at least 19 calibration scenes, and there are 19, [0-9]+ of which lie outs"):
+        calibrate(run, data, "test", progress=told)
+    assert not told  # before it begins
+    monkeypatch.setattr("ast_sim.inference.calibrate._counts", lambda *_: True)
+    assert calibrate(run, data, "test", progress=told).scenes == 19
     assert told[-1] == (19, 19, "test/000018") and len(told) == 19
     assert capfd.readouterr() == ("", "")
 

@@ -510,9 +510,14 @@ def test_a_shift_left_open_is_half_a_cell_as_far_as_the_domain_has_room():
     assert resolve_training(TrainConfig(), SCALES, fine).shift == 0.0  # the paper's
 
 
-def test_scenes_that_are_moved_out_of_the_domain_are_an_error(data, tmp_path):
+def test_scenes_that_are_moved_out_of_the_domain_are_an_error(data, tmp_path, monkeypatch):
+    far = start.configure(data, "tiny", ["train.shift=1e3"])
+    with pytest.raises(ConfigError, match=r"train.shift is 1000, but a training scene is 0.3 from the boundary"):
+        start.start_training(tmp_path / "run", far)
+    assert not (tmp_path / "run").exists()
+    monkeypatch.setattr(start, "measure", lambda data: dataclasses.replace(measure(data), room=math.inf))
     with pytest.raises(DatasetError, match=r"train.*give the dataset a domain_half_width that holds .* train.shift"):
-        start.start_training(tmp_path / "run", start.configure(data, "tiny", ["train.shift=1e3"]))
+        start.start_training(tmp_path / "run", far)
 
 
 @pytest.mark.parametrize(

@@ -34,6 +34,7 @@ from ast_sim.models.simulator import Simulator
 from ast_sim.named_field import STRESS, Output, require_fields
 from ast_sim.number_arrays import percent
 from ast_sim.scene import Trajectory
+from ast_sim.simulate.jobs.recipe import recipe_of
 from ast_sim.support.errors import ConfigError, DatasetError
 
 ONE_STEP_NODES = 8192  # at most, of frames that are predicted together, unless a single one has more
@@ -60,10 +61,10 @@ def evaluate(
 
     Raises:
         DatasetError: the split has no frame to predict.
-        ConfigError: `made_from` is given, but the solver is not asked for.
+        ConfigError: `made_from` is given, but the solver is not asked for, or the dataset was made of other things.
     """
-    if made_from is not None and not solver_scenes:
-        raise ConfigError("made_from is for the solver: give solver_scenes, or leave it out")
+    if made_from is not None:
+        _require_origin(dataset, solver_scenes, made_from)
     indices = dataset.with_frames(split, model.config.data.given_frames + 1)
     if not indices:
         raise DatasetError(f"{dataset.path}: the split {split} has no frame to predict")
@@ -99,6 +100,14 @@ def evaluate(
         threads=torch.get_num_threads(),
         field_units={key: unit for key, _, _, unit in model.config.data.fields},
     )
+
+
+def _require_origin(dataset: Dataset, solver_scenes: int, made_from: str | os.PathLike[str]) -> None:
+    """Raise ConfigError if the solver is not asked for, or the dataset was made of other things, with which it would be
+    left out in the end."""
+    if not solver_scenes:
+        raise ConfigError("made_from is for the solver: give solver_scenes, or leave it out")
+    recipe_of(str(dataset.path), dataset.info, made_from)
 
 
 def _truth(dataset: Dataset, split: str, index: int, data: DataFacts) -> Trajectory:

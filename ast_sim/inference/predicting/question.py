@@ -158,7 +158,10 @@ def _whole_numbers(frames: WantedFrames, count: int) -> list[int]:
             raise ConfigError(wrong) from error
     if isinstance(frames, Mapping):
         raise ConfigError(wrong)
-    listed = np.asarray(list(frames) if isinstance(frames, Iterable) else [frames])
+    try:
+        listed = np.asarray(list(frames) if isinstance(frames, Iterable) else [frames])
+    except TypeError:  # an array of no axis counts as Iterable
+        listed = np.asarray([frames])
     if listed.size and (listed.ndim != 1 or listed.dtype.kind not in "iu"):
         raise ConfigError(wrong)
     return listed.tolist()

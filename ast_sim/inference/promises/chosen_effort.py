@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from ast_sim.inference.effort import Effort
+from ast_sim.inference.effort import Effort, require_effort
 from ast_sim.inference.promises.kept_errors import DISPLACEMENT, KEPT, in_words
+from ast_sim.inference.promises.known_weights import forget_other_weights
 from ast_sim.inference.promises.milliseconds import effort_within
-from ast_sim.support.argument_checks import require_type
 from ast_sim.support.errors import ConfigError, warn
 
 if TYPE_CHECKING:
@@ -27,6 +27,7 @@ def chosen_effort(
         ConfigError: more than one of effort, error and time is given; no effort keeps the error, or the time; or the
             run is not calibrated.
     """
+    forget_other_weights(run)
     if sum(one is not None for one in (effort, error, ms)) > 1:
         raise ConfigError("an effort, an error and a time each choose what is computed: give one of them")
     if ms is not None:
@@ -34,9 +35,8 @@ def chosen_effort(
         return within, [{"effort": within.text, "promise": told} for _ in questions]
     if error is not None:
         return _keeping(run, questions, error if isinstance(error, Mapping) else {DISPLACEMENT: error})
-    effort = run.effort if effort is None else effort
-    require_type("effort", effort, Effort, "an Effort, such as ast_sim.Effort(newton_steps=1)")
-    return effort, [{} for _ in questions]
+    chosen = run.effort if effort is None else require_effort(effort, run.settings.model)
+    return chosen, [{} for _ in questions]
 
 
 def _keeping(

@@ -19,6 +19,7 @@ import numpy as np
 
 from ast_sim.inference.effort import Effort
 from ast_sim.number_arrays import percent
+from ast_sim.support.argument_checks import in_short
 from ast_sim.support.errors import ConfigError
 
 KEPT = 0.9  # of the scenes keep the error that was asked for
@@ -97,9 +98,11 @@ class KeptErrors:
         if quantity not in self.errors:
             raise ConfigError(f"an error of {quantity} is not known; known are {', '.join(self.errors)}")
         if not isinstance(error, Real):
-            raise ConfigError(f"the error of the {quantity} is {error!r}; it must be a number, as 0.02 for 2 %")
+            raise ConfigError(f"the error of the {quantity} is {in_short(error)}; it must be a number, as 0.02 for 2 %")
         if not 0 < error < 1:
-            raise ConfigError(f"the error of the {quantity} is {error}; it must lie between 0 and 1, as 0.02 for 2 %")
+            raise ConfigError(
+                f"the error of the {quantity} is {in_short(error)}; it must lie between 0 and 1, as 0.02 for 2 %"
+            )
         scenes = len(self.errors[quantity][0])
         if scenes < FEWEST:
             raise ConfigError(

@@ -8,7 +8,6 @@ outside the run, since they say nothing on another machine.
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 import statistics
 import time
@@ -21,6 +20,8 @@ import torch
 
 from ast_sim.inference.answering import in_domain
 from ast_sim.inference.effort import Effort, choices
+from ast_sim.inference.promises.known_weights import weights_hash
+from ast_sim.support.argument_checks import in_short
 from ast_sim.support.disk import write_json
 from ast_sim.support.errors import AstSimError, ConfigError
 from ast_sim.support.provenance import processor
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from ast_sim.inference.predicting.question import Question
     from ast_sim.inference.trained_run import Run
 
+LARGEST = 1e300  # milliseconds: every effort takes less
 REPEATS = 3
 SIMILAR = 0.1  # scenes whose numbers of nodes differ by at most this share take the same time
 
@@ -42,7 +44,8 @@ def effort_within(run: Run, question: Question, ms: float) -> tuple[Effort, str]
             step by step; or no errors of its efforts were measured.
     """
     if not isinstance(ms, Real) or isinstance(ms, bool) or not ms > 0:
-        raise ConfigError(f"ms is {ms!r}; it must be a number above 0")
+        raise ConfigError(f"ms is {in_short(ms)}; it must be a number above 0")
+    ms = float(min(ms, LARGEST))
     efforts = choices(run.settings.model, run.settings.train.corrections)
     errors = {effort: run.expected_error(effort) for effort in efforts}
     known = {effort: error for effort, error in errors.items() if error is not None}
@@ -67,7 +70,8 @@ def _times(run: Run, question: Question, efforts: tuple[Effort, ...]) -> dict[Ef
     """Milliseconds of each effort for such a question, from the cache or measured."""
     path = platformdirs.user_cache_path("ast_sim") / "milliseconds.json"
     kept = _read(path)
-    where = f"{_identity(run.model)} on {processor()}, {torch.get_num_threads()} threads"
+    # With the weights: Newton steps end earlier after a better model.
+    where = f"{weights_hash(run.model)} on {processor()}, {torch.get_num_threads()} threads"
     frames = len(question.wanted())
     nodes = question.scene.num_nodes
     try:
@@ -92,14 +96,6 @@ def _read(path: Path) -> dict[str, list[dict[str, Any]]]:
     except (OSError, ValueError):
         return {}
     return kept if isinstance(kept, dict) else {}
-
-
-def _identity(model: torch.nn.Module) -> str:
-    """A hash of the weights: Newton steps end earlier after a better model."""
-    known = hashlib.sha256()
-    for values in model.state_dict().values():
-        known.update(values.contiguous().numpy().tobytes())
-    return known.hexdigest()
 
 
 def _timed(run: Run, question: Question, effort: Effort) -> float:

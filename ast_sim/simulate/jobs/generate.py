@@ -45,9 +45,10 @@ from ast_sim.simulate.own_assembly.spec_reader import read_spec
 from ast_sim.support.argument_checks import file_name, require_bool
 from ast_sim.support.disk import output_file, replacing
 from ast_sim.support.errors import ConfigError, SimulationError
-from ast_sim.support.progress import ShowProgress
-from ast_sim.support.toml_settings import whole
+from ast_sim.support.progress import ShowProgress, require_progress
+from ast_sim.support.toml_settings import require_range, required_whole, whole
 
+MOST_WORKERS = 64  # or two for each core: each takes 0.3 GB
 MOST_SCENES = 1_000_000  # names of samples have six digits
 
 
@@ -111,7 +112,7 @@ def generate(
         MissingExtra: a package that the family, the solver or the scheduler needs is not installed.
     """
     module = family_module(family)
-    self_test()
+    require_progress(progress)
     counts = checked_counts(train, valid, test, calibration)
     workers = checked_workers(workers, scheduler)
     recipe = checked_recipe(module, family, seed, nodes, frames, solver, parts, patient, keep, spec, order)
@@ -190,11 +191,9 @@ def checked_workers(workers: int | None, scheduler: str | None) -> int:
     if workers is not None and scheduler is not None:
         raise ConfigError("workers run on this machine, but a scheduler has its own workers: give one of them")
     (workers,) = whole(1, workers=workers)
-    if workers is not None:
-        return workers
-    if hasattr(os, "sched_getaffinity"):  # not on macOS
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1  # not on macOS
+    require_range("workers", workers, 1, max(MOST_WORKERS, 2 * cores))
+    return workers or cores
 
 
 def checked_counts(train: int, valid: int | None, test: int | None, calibration: int = 0) -> dict[str, int]:
@@ -203,14 +202,9 @@ def checked_counts(train: int, valid: int | None, test: int | None, calibration:
     Raises:
         ConfigError: one is no whole number, all are 0, or there are too many.
     """
-    train, valid, test, calibration = whole(train=train, valid=valid, test=test, calibration=calibration)
-    tenth = -(-train // 10)
-    counts = {
-        "train": train,
-        "valid": tenth if valid is None else valid,
-        "test": tenth if test is None else test,
-        "calibration": calibration,
-    }
+    train, calibration = required_whole(train=train, calibration=calibration)
+    valid, test = (-(-train // 10) if count is None else count for count in whole(valid=valid, test=test))
+    counts = {"train": train, "valid": valid, "test": test, "calibration": calibration}
     if min(counts.values()) < 0 or sum(counts.values()) == 0:
         raise ConfigError(f"counts must be at least 0 and not all 0, got {counts}")
     if sum(counts.values()) > MOST_SCENES:
@@ -222,6 +216,7 @@ def _check_start(out: Path, made: Path, scenes: int, recipe: Recipe, module: Mod
     """Refuse broken parts, and what cannot fit on the disk: positions and stress take four float32 a node and frame.
     Where the folder `made` is there, this was checked before."""
     require_bool(patient=recipe.patient)
+    self_test()
     if made.exists():
         return
     check_parts(recipe)

@@ -19,9 +19,9 @@ from ast_sim.simulate.jobs.samples import Recipe
 from ast_sim.simulate.own_assembly.spec_reader import read_spec
 from ast_sim.simulate.own_assembly.standing import friction_is_drawn
 from ast_sim.simulate.own_assembly.yielding import material_columns
-from ast_sim.support.argument_checks import file_name
+from ast_sim.support.argument_checks import file_name, several
 from ast_sim.support.errors import ConfigError
-from ast_sim.support.toml_settings import whole
+from ast_sim.support.toml_settings import required_whole, whole
 
 if TYPE_CHECKING:
     from ast_sim.simulate.shapes.part_source import PartSource
@@ -137,10 +137,8 @@ def recipe_of(name: str, info: DatasetInfo, made_from: str | os.PathLike[str] | 
 
 def _checked_keep(keep: Sequence[int], last: int) -> tuple[int, ...]:
     """The numbers of the frames to keep, after a check; `last` is the number of the last frame."""
-    try:
-        kept = tuple(whole(**{f"keep[{place}]": frame for place, frame in enumerate(keep)}))
-    except TypeError as error:
-        raise ConfigError(f"keep is {keep!r}; must be a list of whole numbers") from error
+    listed = several("keep", keep, "whole numbers")
+    kept = tuple(required_whole(**{f"keep[{place}]": frame for place, frame in enumerate(listed)}))
     if not kept or not all(1 <= frame <= last for frame in kept):
         raise ConfigError(f"keep is {list(kept)}; must be numbers of frames from 1 to {last}, beside frame 0")
     if any(later <= earlier for earlier, later in pairwise(kept)):

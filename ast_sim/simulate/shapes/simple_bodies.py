@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from numbers import Integral
 from typing import Any
@@ -11,8 +12,10 @@ import numpy as np
 from ast_sim.number_arrays import real_numbers, three_numbers
 from ast_sim.scene import Scene
 from ast_sim.simulate.shapes import mesh
-from ast_sim.support.argument_checks import several
+from ast_sim.support.argument_checks import in_short, several
 from ast_sim.support.errors import ConfigError
+
+MOST_CELLS = 10_000_000
 
 
 def box(low: Sequence[float], high: Sequence[float], cells: Sequence[int], **arrays: Any) -> Scene:
@@ -29,7 +32,7 @@ def box(low: Sequence[float], high: Sequence[float], cells: Sequence[int], **arr
     """
     low, high = three_numbers("the box", "low", low), three_numbers("the box", "high", high)
     size = np.subtract(high, low)
-    _require_above_zero("the box", size, cells)
+    cells = _above_zero("the box", size, cells)
     coordinates, elements = mesh.hexahedral_grid(tuple(cells))
     return Scene.of(coordinates / np.asarray(cells) * size + low, elements, **arrays)
 
@@ -44,15 +47,27 @@ def plate(size: Sequence[float], cells: Sequence[int], holes: Sequence[Sequence[
         arrays: other arguments of `Scene.of`.
 
     Raises:
-        ConfigError: a size or a number of cells is not above 0.
+        ConfigError: a size or a number of cells is not above 0, or a hole leaves out no cell.
         DatasetError: these are no numbers, or not three where three are needed.
     """
     size = three_numbers("the plate", "size", size)
-    _require_above_zero("the plate", size, cells)
+    cells = _above_zero("the plate", size, cells)
     cut = real_numbers("the plate", "holes", holes).astype(np.float64)
     if cut.size and (cut.ndim != 2 or cut.shape[1] != 3 or not (cut[:, 2] > 0).all() or not np.isfinite(cut).all()):
         raise ConfigError("the holes of the plate must be triples: centre x, centre y and a radius above 0")
+    for hole in cut.reshape(-1, 3):
+        _require_cut(size, cells, hole)
     return Scene.of(*mesh.plate(tuple(size), tuple(cells), cut.reshape(-1, 3)), **arrays)
+
+
+def _require_cut(size: np.ndarray, cells: Sequence[int], hole: np.ndarray) -> None:
+    """Raise ConfigError if a hole leaves out no cell, as if it were not there."""
+    x, y = (size[axis] * ((np.arange(cells[axis]) + 0.5) / cells[axis] - 0.5) - hole[axis] for axis in (0, 1))
+    if not (x[:, None] ** 2 + y**2 < hole[2] ** 2).any():
+        raise ConfigError(
+            f"no cell of the plate has its centre in the hole at ({hole[0]:g}, {hole[1]:g}) of radius {hole[2]:g}: move"
+            " the hole, or take more cells"
+        )
 
 
 def ball(center: Sequence[float], radius: float, cells: int, **arrays: Any) -> Scene:
@@ -68,7 +83,7 @@ def ball(center: Sequence[float], radius: float, cells: int, **arrays: Any) -> S
         ConfigError: the radius is not above 0, or the number of cells is not even.
         DatasetError: these are no numbers, or not three where three are needed.
     """
-    _require_above_zero("the ball", [radius], [cells], even=True)
+    _above_zero("the ball", [radius], [cells], even=True)
     center = three_numbers("the ball", "center", center)
     position, elements = mesh.ball(radius, cells)
     return Scene.of(position + center, elements, **arrays)
@@ -90,7 +105,7 @@ def cylinder(
         ConfigError: a size is not above 0, the number of cells is not even, or there is no such axis.
         DatasetError: these are no numbers, or not three where three are needed.
     """
-    _require_above_zero("the cylinder", [radius, length], [cells], even=True)
+    _above_zero("the cylinder", [radius, length], [cells], even=True)
     center = three_numbers("the cylinder", "center", center)
     if axis not in ("x", "y", "z"):
         raise ConfigError(f"the axis of the cylinder is {axis!r}; must be x, y or z")
@@ -98,9 +113,8 @@ def cylinder(
     return Scene.of(np.roll(position, "xyz".index(axis), axis=1) + center, elements, **arrays)
 
 
-def _require_above_zero(
-    what: str, sizes: Sequence[float] | np.ndarray, cells: Sequence[int], even: bool = False
-) -> None:
+def _above_zero(what: str, sizes: Sequence[float] | np.ndarray, cells: Sequence[int], even: bool = False) -> list[int]:
+    """The numbers of cells, after a check."""
     if not (real_numbers(what, "its sizes", sizes) > 0).all() or not np.isfinite(sizes).all():
         shown = ", ".join(f"{size:g}" for size in sizes)
         raise ConfigError(f"{what} has the size [{shown}]; every size must be above 0")
@@ -109,3 +123,7 @@ def _require_above_zero(
     if not whole or len(counts) != (1 if even else 3) or (even and counts[0] % 2):
         needs = "an even whole number" if even else "three whole numbers"
         raise ConfigError(f"{what} has {counts} cells; must be {needs} above 0")
+    if math.prod(map(int, counts)) > MOST_CELLS:
+        told = " x ".join(map(in_short, counts))
+        raise ConfigError(f"{what} has {told} cells; more than {MOST_CELLS:,} are too many for one scene")
+    return counts

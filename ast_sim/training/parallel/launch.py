@@ -25,6 +25,7 @@ from ast_sim.support.toml_settings import require_range
 LEAST_NODES = 3000  # of a process in a step; below, two processes are no faster than one (docs/log.md, 2026-11-27)
 SMALL = 2e6  # nodes times samples; so small trainings end before other processes are ready
 LEAST_MINUTES = 1.0
+MOST = 8  # processes, or one for each core: more are no faster, and each takes half a gigabyte
 PATIENCE = 60.0  # seconds that a process has for its end
 READY = b"ready\n"  # what another process writes before it trains
 _HERE = "127.0.0.1"
@@ -57,6 +58,12 @@ def usual_processes(config: RunConfig) -> int:
     return max(count for count in range(1, max(1, most) + 1) if options.batch_size % count == 0)
 
 
+def require_cut(config: RunConfig, processes: int) -> None:
+    """Raise ConfigError unless each process can take an equal part of every batch."""
+    if config.train.batch_size % processes:
+        raise ConfigError(f"train.batch_size = {config.train.batch_size} cannot be cut for {processes} processes")
+
+
 def _is_from_a_script(config: RunConfig) -> bool:
     """Whether no other process can import the model."""
     return type(config.model).__module__ == "__main__"
@@ -71,10 +78,12 @@ def together(count: int, config: RunConfig | None, arguments: Mapping[str, Any])
         arguments: of `start_training`, for the other processes.
 
     Raises:
-        ConfigError: the count is below 1, or another process cannot import the model.
+        ConfigError: the count is out of range, batches cannot be cut, or another process cannot import the model.
         TrainingError: another process could not start, or ended.
     """
-    require_range("train.processes", count, 1)
+    require_range("train.processes", count, 1, max(MOST, os.cpu_count() or 1))
+    if config is not None:
+        require_cut(config, count)
     if count == 1:
         yield
         return

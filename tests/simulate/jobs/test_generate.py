@@ -346,7 +346,7 @@ def test_two_runs_on_one_file_exclude_each_other(tmp_path):
         ({"frames": 9, "keep": [3, 9]}, r"keep is \[3, 9\]; must be numbers of frames from 1 to 8"),
         ({"family": "abcd", "keep": [21]}, r"keep is \[21\]; must be numbers of frames from 1 to 20"),
         ({"keep": [3, 2]}, r"keep is \[3, 2\]; the numbers of frames must ascend"),
-        ({"keep": 3}, r"keep is 3; must be a list of whole numbers"),
+        ({"keep": 3}, r"keep is 3; it must be a list of whole numbers"),
         ({"keep": [3.5]}, r"keep\[0\] is 3.5; it must be a whole number"),
         ({"keep": [True]}, r"keep\[0\] is True; it must be a whole number"),
         ({"train": 2.0}, r"train is 2.0; it must be a whole number"),
