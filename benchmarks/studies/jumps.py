@@ -112,6 +112,9 @@ ROWS = {
         "Plates, 1,300 nodes, second-order", steps=12_000, settings=_MIRRORED, solver_scenes=10, **_SECOND_ORDER
     ),
     "parts400": Row("Pairs of parts, 400 nodes", steps=10_000, settings=_TURNED, solver_scenes=5, **_PARTS),
+    "parts400_long": Row(
+        "Pairs of parts, 400 nodes, 36,000 steps", steps=36_000, settings=_TURNED, solver_scenes=5, **_PARTS
+    ),
     "parts400_transolver": Row(
         "Pairs of parts, 400 nodes, Transolver", steps=11_800, model="transolver", settings=_TURNED, **_PARTS
     ),

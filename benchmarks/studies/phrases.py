@@ -65,8 +65,11 @@ def _settings(names: set[str]) -> str:
 def times_as_long(taken: Sequence[float], ratios: Sequence[float]) -> str:
     """The median of the solver's seconds, and the median of its times over the answers' times, with its standard
     error."""
-    spread = f" ± {median_error(ratios):.1g}" if len(ratios) > 1 else ""
-    return f"{1000 * np.median(taken):.0f} ms, {np.median(ratios):.2g}{spread} times as long"
+    ratio = f"{np.median(ratios):.2g}"
+    if len(ratios) > 1:
+        error = median_error(ratios)
+        ratio += f" ± {error:.0f}" if error >= 9.5 else f" ± {error:.1g}"
+    return f"{1000 * np.median(taken):.0f} ms, {ratio} times as long"
 
 
 def median_error(values: Sequence[float]) -> float:
