@@ -125,7 +125,8 @@ def test_a_run_that_starts_from_another_one_is_killed_and_resumes_to_the_same_bi
 def test_signals_finish_the_step_write_a_checkpoint_and_exit(undisturbed, tmp_path, number, code):
     data, expected = undisturbed
     run = tmp_path / "run"
-    process = start(data, "--out", run, settings=SMALL)
+    heed = lambda: signal.signal(number, signal.SIG_DFL)  # noqa: E731 (the tests themselves may run under nohup)
+    process = start(data, "--out", run, settings=SMALL, preexec_fn=heed)
     wait_for_progress(process, run, -1)
     process.send_signal(number)
     out, error = finish(process, code)
