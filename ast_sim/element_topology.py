@@ -9,6 +9,8 @@ from itertools import combinations
 
 import numpy as np
 
+from ast_sim.support.read_only_arrays import kept
+
 # What meshio calls an element, by the number of its nodes.
 CELL_KINDS = {3: "triangle", 4: "tetra", 10: "tetra10"}
 
@@ -72,9 +74,7 @@ def unique_edges(elements: np.ndarray, num_nodes: int) -> np.ndarray:
     pairs = np.array(LOCAL_EDGES[elements.shape[1]]).T
     one, other = (elements[:, ends].ravel().astype(np.int64) for ends in pairs)
     keys = distinct(np.minimum(one, other) * num_nodes + np.maximum(one, other))
-    edges = np.stack(np.divmod(keys, num_nodes), axis=1).astype(np.int32)
-    edges.setflags(write=False)
-    return edges
+    return kept(np.stack(np.divmod(keys, num_nodes), axis=1).astype(np.int32))
 
 
 def signed_volumes(points: np.ndarray, elements: np.ndarray) -> np.ndarray:
@@ -121,6 +121,4 @@ def triangles_of_faces(elements: np.ndarray, outer: np.ndarray, volumes: np.ndar
     turned = volumes[outer // 4] < 0
     local = np.array(FACE_TRIANGLES[elements.shape[1]])[outer % 4]  # [F, 1 or 4, 3]
     triangles = owner[np.arange(len(owner))[:, None, None], local]
-    surface = np.where(turned[:, None, None], triangles[:, :, ::-1], triangles).reshape(-1, 3).astype(np.int32)
-    surface.setflags(write=False)
-    return surface
+    return kept(np.where(turned[:, None, None], triangles[:, :, ::-1], triangles).reshape(-1, 3).astype(np.int32))

@@ -32,6 +32,9 @@ typedef struct {
   int64_t k0; /* -1: nothing is rounded yet */
 } bfloat16_block;
 
+/* Fewer inputs do not fill a tile: rounding them costs more than it gains. */
+AST_INLINE bool bfloat16_pays(int64_t K) { return K >= BFLOAT16_STEP; }
+
 /* Of a panel, in units of float: a pair takes as much room. */
 AST_INLINE int64_t bfloat16_panel_size(int64_t K) { return round_up(K, BFLOAT16_STEP) / 2 * GEMM_COLUMNS; }
 

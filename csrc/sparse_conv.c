@@ -42,14 +42,12 @@ typedef struct {
 #ifdef AST_BFLOAT16
 _Static_assert((int)PAIR_TILE <= (int)BFLOAT16_ROWS && (int)CHAIN_CHANNELS == (int)BFLOAT16_DEPTH,
                "the rows of a tile are a block, a chain is what is rounded at a time");
-/* Fewer inputs do not fill a tile: rounding them costs more than it gains. */
-AST_INLINE bool conv_is_rounded(const conv_job *job) { return job->C_in >= BFLOAT16_STEP; }
 #endif
 
 /* Floats of a panel. */
 AST_INLINE int64_t conv_panel_size(const conv_job *job) {
 #ifdef AST_BFLOAT16
-  if (conv_is_rounded(job)) return bfloat16_panel_size(job->C_in);
+  if (bfloat16_pays(job->C_in)) return bfloat16_panel_size(job->C_in);
 #endif
   return job->C_in * GEMM_COLUMNS;
 }
@@ -69,7 +67,7 @@ static ast_status conv_pack_task(int64_t index, void *context) {
   const float *weight = job->weight + k * C_in * C_out + column * from_column;
   float *panel = conv_panel(job, k, column);
 #ifdef AST_BFLOAT16
-  if (conv_is_rounded(job)) {
+  if (bfloat16_pays(job->C_in)) {
     bfloat16_pack_columns(weight, from_row, from_column, C_in, n, panel);
     return AST_OK;
   }
@@ -147,7 +145,7 @@ static void conv_rounded_chain(const conv_job *job, const conv_walk *tile, const
 AST_INLINE void conv_chain(const conv_job *job, const conv_walk *tile, const conv_rows *rows, const conv_walk *next,
                            const conv_rows *next_rows, int64_t first, int64_t column, int64_t columns) {
 #ifdef AST_BFLOAT16
-  if (conv_is_rounded(job)) {
+  if (bfloat16_pays(job->C_in)) {
     conv_rounded_chain(job, tile, rows, next, next_rows, first, column, columns);
     return;
   }

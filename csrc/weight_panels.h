@@ -52,14 +52,12 @@ AST_INLINE int64_t dense_panel_width(const dense_layer *l) { return l->paired ? 
 AST_INLINE int64_t dense_panels(const dense_layer *l) { return divide_up(l->N, dense_panel_width(l)); }
 #ifdef AST_BFLOAT16
 _Static_assert((int)DENSE_ROWS == (int)BFLOAT16_ROWS, "blocks of rows have one size");
-/* Fewer inputs do not fill a tile: rounding them costs more than it gains. */
-AST_INLINE bool dense_is_rounded(const dense_layer *l) { return l->K >= BFLOAT16_STEP; }
 #endif
 
 /* Floats of a panel. */
 AST_INLINE int64_t dense_panel_size(const dense_layer *l) {
 #ifdef AST_BFLOAT16
-  if (dense_is_rounded(l)) return bfloat16_panel_size(l->K);
+  if (bfloat16_pays(l->K)) return bfloat16_panel_size(l->K);
 #endif
   return l->K * GEMM_COLUMNS;
 }
@@ -81,12 +79,12 @@ static void dense_pack_inputs(const dense_layer *l, int64_t j, int64_t n, int64_
 
 static void dense_pack_outputs(const dense_layer *l, int64_t j, int64_t n, float *panel) {
 #ifdef AST_BFLOAT16
-  for (int64_t k = 0; dense_is_rounded(l) && k < l->K; k += BFLOAT16_STEP) {
+  for (int64_t k = 0; bfloat16_pays(l->K) && k < l->K; k += BFLOAT16_STEP) {
     float step[BFLOAT16_STEP * GEMM_COLUMNS] = {0};
     dense_pack_inputs(l, j, n, k, min64(BFLOAT16_STEP, l->K - k), step);
     bfloat16_pack(step, GEMM_COLUMNS, panel + k / 2 * GEMM_COLUMNS);
   }
-  if (dense_is_rounded(l)) return;
+  if (bfloat16_pays(l->K)) return;
 #endif
   dense_pack_inputs(l, j, n, 0, l->K, panel);
 }
@@ -229,7 +227,7 @@ AST_INLINE void dense_new_block(dense_block *block, const dense_layer *l, gemm_a
 AST_INLINE void dense_begin_panel(dense_block *block, int64_t p) {
 #ifdef AST_BFLOAT16
   const dense_layer *l = block->layer;
-  if (dense_is_rounded(l)) bfloat16_sums(block->rows, l->K, block->a, dense_panel(l, p), &block->rounded);
+  if (bfloat16_pays(l->K)) bfloat16_sums(block->rows, l->K, block->a, dense_panel(l, p), &block->rounded);
 #else
   (void)block, (void)p;
 #endif
@@ -241,7 +239,7 @@ AST_INLINE void dense_sums(const int rows, const int vectors, const dense_block 
                            vf sum[GEMM_ROWS][2]) {
   const dense_layer *l = block->layer;
 #ifdef AST_BFLOAT16
-  if (dense_is_rounded(l)) {
+  if (bfloat16_pays(l->K)) {
     TILE_EACH(i, v) sum[i][v] = vload(block->rounded.sums + (i0 + i) * GEMM_COLUMNS + v * VW);
     return;
   }

@@ -28,6 +28,7 @@ from ast_sim.dataset.layout import (
 )
 from ast_sim.scene import AttributeValue
 from ast_sim.support.errors import AstSimError, DatasetError
+from ast_sim.support.read_only_arrays import kept
 
 HASHED_AT_ONCE = 1 << 24
 
@@ -202,8 +203,7 @@ class GuardedFile:
             if name not in self._verified:
                 whole = [value] if value.shape == array.shape else _rows(array)
                 self._verify(name, array_hash(array.dtype, array.shape, whole), array.attrs.get(HASH))
-        value.flags.writeable = False
-        return value
+        return kept(value)
 
 
 def _path(group: h5py.Group | h5py.Dataset, key: str = "") -> str:

@@ -39,6 +39,7 @@ from ast_sim.support.argument_checks import file_name, require_type, several
 from ast_sim.support.byte_cache import ByteCache, cache_bytes
 from ast_sim.support.errors import DatasetError
 from ast_sim.support.notebook_table import html_table, one_line
+from ast_sim.support.read_only_arrays import kept
 
 if TYPE_CHECKING:
     from ast_sim import FramePairs
@@ -306,7 +307,8 @@ class Dataset:
         key = (split, index)
         if key not in self._open:
             group = self._unverified(split, index)
-            if not (count := len(self._file.array(group, "position"))):
+            count = len(self._file.array(group, "position"))
+            if count == 0:
                 raise DatasetError(f"{self._name(split, index)}: position has no frames")
             nodes = len(self._file.array(group, "rest_position"))
             shapes = {"position": (count, nodes, 3)}
@@ -332,9 +334,7 @@ class Dataset:
         """Positions in the unit of `info`."""
         if self._scale == 1:
             return position
-        scaled = (self._scale * position.astype(np.float64)).astype(np.float32)
-        scaled.flags.writeable = False
-        return scaled
+        return kept((self._scale * position.astype(np.float64)).astype(np.float32))
 
     def _finite(self, name: str, row: str, array: h5py.Dataset, start: int, stop: int) -> np.ndarray:
         """Frames start to stop - 1 of an array, all finite; a `row` of it is a "node" or an "element"."""

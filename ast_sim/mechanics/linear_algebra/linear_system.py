@@ -76,8 +76,8 @@ class LinearSystem:
         self.free = np.flatnonzero(free)
         self._count = len(self.free)
         self._number = np.where(free, np.cumsum(free) - 1, -1).astype(np.int32)
-        self._entries, self._is_free = entries, free
-        sparsity = Sparsity(entries, np.where(prescribed, -1, np.cumsum(~prescribed) - 1))
+        self._entries = entries
+        sparsity = Sparsity(entries, self._number[::3] // 3)  # -1 stays -1
         rows = np.repeat(np.arange(self._count), np.diff(sparsity.starts))
         self._own, self._slot = rows * self._count + sparsity.columns, sparsity.slot
         self._factorization = factorization()
@@ -183,7 +183,7 @@ class LinearSystem:
     def _mixed(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The entries between a free and a prescribed dof: their numbers, rows and columns."""
         rows, columns = entry_dofs(self._entries)
-        mixed = np.flatnonzero(self._is_free[rows] != self._is_free[columns])
+        mixed = np.flatnonzero((self._number[rows] < 0) != (self._number[columns] < 0))
         return mixed, rows[mixed], columns[mixed]
 
     def coupling(
