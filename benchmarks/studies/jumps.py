@@ -108,6 +108,9 @@ ROWS = {
     "plates1300_transolver": Row(
         "Plates, 1,300 nodes, Transolver", steps=14_100, model="transolver", settings=_MIRRORED, **_PLATES_1300
     ),
+    "plates1300_mgn": Row(
+        "Plates, 1,300 nodes, MeshGraphNets", steps=9_800, model="mgn", settings=_MIRRORED, **_PLATES_1300
+    ),
     "plates1300_second_order": Row(
         "Plates, 1,300 nodes, second-order", steps=12_000, settings=_MIRRORED, solver_scenes=10, **_SECOND_ORDER
     ),
@@ -117,6 +120,10 @@ ROWS = {
     ),
     "parts400_transolver": Row(
         "Pairs of parts, 400 nodes, Transolver", steps=11_800, model="transolver", settings=_TURNED, **_PARTS
+    ),
+    "parts400_long_transolver": Row(
+        "Pairs of parts, 400 nodes, Transolver, 42,500 steps", steps=42_500, model="transolver", settings=_TURNED,
+        **_PARTS,
     ),
 }  # fmt: skip
 
