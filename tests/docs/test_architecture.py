@@ -19,6 +19,7 @@ from ast_sim.runs import checkpoint
 from ast_sim.runs.metrics import Metrics
 from ast_sim.training.loop import JUMP_BATCHES
 
+PACKAGE = Path(ast_sim.__file__).parent
 PAGE = (Path(__file__).parents[2] / "docs" / "architecture.md").read_text(encoding="utf-8")
 SMALL = {"hidden": 16, "decoder_hidden": 16, "d_token": 16, "heads": 1, "head_dim": 16, "ffn_inner": 16, "L_SA": 1}
 
@@ -27,6 +28,13 @@ def named(title: str) -> list[str]:
     """The functions that a part of the page counts, in order."""
     part = PAGE.split(f"## {title}\n")[1].split("\n## ")[0]
     return re.findall(r"^\d\. `([\w.]+)`", part, re.MULTILINE)
+
+
+def test_every_room_stands_in_the_table():
+    table = PAGE.split("## The rooms\n")[1].split("\n## ")[0]
+    rooms = set(re.findall(r"`(\w+(?:/|\.py))`", table))
+    there = {path.name + "/" * path.is_dir() for path in PACKAGE.iterdir() if path.suffix in ("", ".py")}
+    assert there - rooms - {"__pycache__/"} == {"__init__.py"}
 
 
 @pytest.fixture(scope="module")
