@@ -205,7 +205,7 @@ def _add_convert(convert: Parser) -> None:
 
 
 def _add_info(info: Parser) -> None:
-    info.add_argument("path", type=path, metavar="FILE_OR_RUN", help="dataset (.h5), run folder or run file (.ast)")
+    info.add_argument("path", type=path, metavar="FILE_OR_RUN", help="dataset (.h5), or run: a folder or a file (.ast)")
     info.add_argument("--json", action="store_true", help="print JSON")
     info.add_argument("--strict", action="store_true", help="exit with an error if something looks wrong")
 
@@ -234,7 +234,7 @@ def _add_train(train: Parser) -> None:
 
 
 def _add_predict(predict: Parser) -> None:
-    predict.add_argument("run_folder", type=path, metavar="RUN", help="run folder")
+    predict.add_argument("run_folder", type=path, metavar="RUN", help="run: a folder or a file (.ast)")
     about = "a mesh (.vtu, .msh, .inp, .stl, ...), a dataset (.h5), or the specification of an assembly (.toml)"
     predict.add_argument("scene", type=path, metavar="SCENE", help=about)
     add_out(predict, "FILE", "file to write: .h5, .pvd or .vtkhdf for ParaView, or .csv")
@@ -279,7 +279,7 @@ def _add_predict(predict: Parser) -> None:
 
 
 def _add_sweep(sweep: Parser) -> None:
-    sweep.add_argument("run_folder", type=path, metavar="RUN", help="run folder")
+    sweep.add_argument("run_folder", type=path, metavar="RUN", help="run: a folder or a file (.ast)")
     sweep.add_argument("spec", type=path, metavar="SPEC", help="specification of the assembly (.toml)")
     add_out(sweep, "FILE", "table to write (.csv); a picture with the same name is written beside it (.png)")
     about = "values of a parameter: travel=1:7:13 (from, to, how many), young=1e6,2e6; may be repeated: a grid"

@@ -71,7 +71,7 @@ def _look(args: argparse.Namespace) -> None:
     scenes = sum(checked_counts(args.count or 100, args.valid, args.test, args.calibration).values())
     workers = checked_workers(args.workers, None)
     cost = duration(each * scenes / workers)
-    print(f"--count {args.count or 100}: {scenes} scenes, about {cost} with {workers} processes")
+    print(f"--count {args.count or 100}: {scenes} scenes, about {cost} with {workers} process{'es' * (workers > 1)}")
     print(f"picture: {picture}")
 
 

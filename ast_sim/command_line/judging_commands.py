@@ -17,7 +17,7 @@ def _add_made_from(to: Parser) -> None:
 
 def add_evaluate(evaluate: Parser) -> None:
     """The arguments of `evaluate`."""
-    evaluate.add_argument("run_folder", type=path, metavar="RUN", help="run folder")
+    evaluate.add_argument("run_folder", type=path, metavar="RUN", help="run: a folder or a file (.ast)")
     evaluate.add_argument("data", type=path, metavar="DATA", help="dataset")
     evaluate.add_argument("--split", choices=SPLITS, default="test", help="split (default: test)")
     about = f"scenes in which the solver solves the deepest frame, to compare (default: {SOLVER_SCENES}; 0: none)"
@@ -42,7 +42,7 @@ def evaluate(args: argparse.Namespace) -> None:
 
 def add_calibrate(calibrate: Parser) -> None:
     """The arguments of `calibrate`."""
-    calibrate.add_argument("run_folder", type=path, metavar="RUN", help="run folder")
+    calibrate.add_argument("run_folder", type=path, metavar="RUN", help="run folder, which keeps the result")
     calibrate.add_argument("data", type=path, metavar="DATA", help="dataset with 19 or more scenes new to RUN")
     about = "split (default: calibration)"
     calibrate.add_argument("--split", choices=SPLITS, default="calibration", help=about)
@@ -57,7 +57,7 @@ def calibrate(args: argparse.Namespace) -> None:
 
 def add_trade(trade: Parser) -> None:
     """The arguments of `trade`."""
-    trade.add_argument("run_folder", type=path, metavar="RUN", help="run folder")
+    trade.add_argument("run_folder", type=path, metavar="RUN", help="run: a folder or a file (.ast)")
     trade.add_argument("data", type=path, metavar="DATA", help="dataset with scenes new to RUN (.h5)")
     add_out(trade, "FILE.html", "page to write; all figures lie beside it (.json)")
     trade.add_argument("--split", choices=SPLITS, default="test", help="split (default: test)")
@@ -96,7 +96,7 @@ def trade(args: argparse.Namespace) -> None:
 
 def add_report(report: Parser) -> None:
     """The arguments of `report`."""
-    report.add_argument("shown", type=path, nargs="+", metavar="RUN_OR_DATA", help="run folders, or one dataset (.h5)")
+    report.add_argument("shown", type=path, nargs="+", metavar="RUN_OR_DATA", help="runs, or one dataset (.h5)")
     add_each(report, {"--out FILE.html": "page to write"}, type=path, required=True)
     add_each(report, {"--data DATA": "dataset for all runs (default: the training data of each run)"}, type=path)
     add_overwrite(report)

@@ -133,7 +133,7 @@ def _repeats(position: np.ndarray, stress: np.ndarray | None) -> list[Finding]:
     moves = len(position) > 1 and not (position == position[0]).all()
     if not len(rows) or not moves:
         return []
-    meaning = "each is the frame before it once more: was it written twice?"
+    meaning = "each is the frame before it once more: does all hold still, or was it written twice?"
     return [Finding("frames that repeat", len(rows), places("frames", rows), meaning)]
 
 
