@@ -77,6 +77,18 @@ def unique_edges(elements: np.ndarray, num_nodes: int) -> np.ndarray:
     return kept(np.stack(np.divmod(keys, num_nodes), axis=1).astype(np.int32))
 
 
+def triangle_sides(triangles: np.ndarray) -> np.ndarray:
+    """[3 F, 2]: the three edges of each triangle, one triangle after the other, with the smaller node first."""
+    return np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+
+
+def equal_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The numbers of rows [n, k] that are equal, as pairs: each such row but the last with the next one like it."""
+    order = np.lexsort(rows.T)
+    same = (rows[order[1:]] == rows[order[:-1]]).all(axis=1)
+    return order[:-1][same], order[1:][same]
+
+
 def signed_volumes(points: np.ndarray, elements: np.ndarray) -> np.ndarray:
     """[E] float64: the volumes between the corners of tetrahedra [E, 4] or [E, 10], negative if they are inside out."""
     coordinates = np.ascontiguousarray(points.T, np.float64)

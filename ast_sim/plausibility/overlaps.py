@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ast_sim.element_topology import triangle_sides
 from ast_sim.number_arrays import point
 from ast_sim.plausibility.findings import Finding
 from ast_sim.scene import Scene
@@ -91,7 +92,7 @@ def _cut(rest: np.ndarray, first: np.ndarray, second: np.ndarray, tolerated: flo
     """Where an edge of one surface goes through a face of the other, farther than `tolerated` from all nodes of
     both."""
     for mine, other in ((first, second), (second, first)):
-        edges = np.unique(np.sort(mine[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0)
+        edges = np.unique(triangle_sides(mine), axis=0)
         edge, face = _near(rest[edges], rest[other])
         if not len(edge):
             continue

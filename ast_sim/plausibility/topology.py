@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ast_sim.element_topology import LOCAL_FACES, linear_elements, signed_volumes
+from ast_sim.element_topology import LOCAL_FACES, equal_rows, linear_elements, signed_volumes
 from ast_sim.number_arrays import connected_parts
 from ast_sim.plausibility.findings import Finding, places
 from ast_sim.plausibility.overlaps import overlaps
@@ -39,10 +39,7 @@ def turned_over(scene: Scene) -> np.ndarray | None:
 
 
 def _twice(scene: Scene) -> list[Finding]:
-    ordered = np.sort(scene.elements, axis=1)
-    order = np.lexsort(ordered.T)
-    same = (ordered[order[1:]] == ordered[order[:-1]]).all(axis=1)
-    rows = np.sort(order[1:][same])
+    rows = np.sort(equal_rows(np.sort(scene.elements, axis=1))[1])
     meaning = "the material is twice as stiff there, and faces between bodies are missed: write each element once"
     return [Finding("elements that stand twice", len(rows), _elements(scene, rows), meaning)] if len(rows) else []
 
@@ -110,10 +107,7 @@ def _faces_on_faces(scene: Scene) -> list[Finding]:
     for _ in range(3):  # chains of points at one place are short
         np.minimum.at(place, nodes[pairs[:, 1]], place[nodes[pairs[:, 0]]])
         np.minimum.at(place, nodes[pairs[:, 0]], place[nodes[pairs[:, 1]]])
-    keys = np.sort(place[surface], axis=1)
-    order = np.lexsort(keys.T)
-    same = (keys[order[1:]] == keys[order[:-1]]).all(axis=1)
-    rows = surface[np.sort(order[1:][same]), 0]
+    rows = surface[np.sort(equal_rows(np.sort(place[surface], axis=1))[1]), 0]
     if not len(rows):
         return []
     meaning = "bodies touch there at rest, or a mesh is not joined: one body needs common points"

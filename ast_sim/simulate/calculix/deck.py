@@ -13,6 +13,7 @@ from typing import TextIO
 import numpy as np
 from scipy.spatial import cKDTree
 
+from ast_sim.element_topology import equal_rows, triangle_sides
 from ast_sim.mechanics.case import SolidCase
 from ast_sim.mechanics.driven import Driven
 from ast_sim.scene import Scene
@@ -184,11 +185,10 @@ def _convex_angle(position: np.ndarray, faces: np.ndarray, near: np.ndarray) -> 
     corners = position[faces]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    order = np.lexsort(edges.T)
-    first, second = order[:-1], order[1:]
-    shared = (edges[first] == edges[second]).all(axis=1) & near[edges[first]].any(axis=1)
-    one, other = first[shared] // 3, second[shared] // 3
+    edges = triangle_sides(faces)
+    first, second = equal_rows(edges)
+    concerned = near[edges[first]].any(axis=1)
+    one, other = first[concerned] // 3, second[concerned] // 3
     across = corners[other].mean(axis=1) - corners[one].mean(axis=1)
     convex = np.einsum("ij,ij->i", across, normal[one]) < 0
     cosine = np.einsum("ij,ij->i", normal[one], normal[other])[convex]

@@ -11,6 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
+from ast_sim.element_topology import equal_rows, triangle_sides
 from ast_sim.mechanics.contact_and_friction import load_ipctk
 from ast_sim.plausibility import overlaps
 
@@ -58,19 +59,16 @@ class Surfaces:
     @cached_property
     def arcs(self) -> np.ndarray:
         """[F] the height of the arc over each triangle: h t / 8 for an angle of t between facets of the width h."""
-        edges = np.sort(self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        edges = triangle_sides(self.faces)
         length = np.linalg.norm(self.position[edges[:, 0]] - self.position[edges[:, 1]], axis=1)
         width = np.repeat(np.linalg.norm(self._areas, axis=1), 3) / length
-        owner = np.repeat(np.arange(len(self.faces)), 3)
-        order = np.lexsort(edges.T)
-        same = (edges[order[1:]] == edges[order[:-1]]).all(axis=1)
-        one, other = order[:-1][same], order[1:][same]
-        cosine = np.einsum("ei,ei->e", self.normals[owner[one]], self.normals[owner[other]])
+        one, other = equal_rows(edges)
+        cosine = np.einsum("ei,ei->e", self.normals[one // 3], self.normals[other // 3])
         angle = np.arccos(np.clip(cosine, -1, 1))
         height = np.where(angle < CREASE, np.maximum(width[one], width[other]) * angle / 8, 0)
         arcs = np.zeros(len(self.faces))
-        np.maximum.at(arcs, owner[one], height)
-        np.maximum.at(arcs, owner[other], height)
+        np.maximum.at(arcs, one // 3, height)
+        np.maximum.at(arcs, other // 3, height)
         return arcs
 
     def of(self, part: int) -> np.ndarray:

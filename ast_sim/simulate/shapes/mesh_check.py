@@ -6,13 +6,11 @@ Legend: N nodes, E tetrahedra, F triangles; lengths in the units of the part.
 from __future__ import annotations
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from ast_sim.element_topology import FACE_TRIANGLES, LOCAL_FACES
+from ast_sim.element_topology import FACE_TRIANGLES, LOCAL_FACES, equal_rows, triangle_sides
 from ast_sim.mechanics.contact_and_friction import load_ipctk
-from ast_sim.number_arrays import point
+from ast_sim.number_arrays import connected_parts, point
 from ast_sim.simulate.shapes.cad.surface_mend import TriangleSurface, solids_of
 from ast_sim.simulate.shapes.parts import smallest_dihedral, volumes
 from ast_sim.support.errors import SimulationError
@@ -81,8 +79,7 @@ def check_surface(position: np.ndarray, triangles: np.ndarray, name: str) -> Non
     finite = np.isfinite(position).all(axis=1)
     if not finite.all():
         raise BadMesh(f"{name}: a corner is not finite: {point(position[np.argmin(finite)])}")
-    edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    edges, uses = np.unique(edges, axis=0, return_counts=True)
+    edges, uses = np.unique(triangle_sides(triangles), axis=0, return_counts=True)
     for wrong, what in (
         (uses == 1, "its surface is open: {} with a triangle on one side only"),
         (uses > 2, "its surface does not bound a solid: {} with more than two triangles"),
@@ -165,12 +162,7 @@ def _check_pieces(label: np.ndarray, centre: np.ndarray, name: str, how: str) ->
 def _element_pieces(elements: np.ndarray) -> np.ndarray:
     """The piece [E] that each tetrahedron belongs to. Tetrahedra that share a face belong to one piece."""
     faces = np.sort(elements[:, np.array(LOCAL_FACES)], axis=2).reshape(-1, 3)
-    owner = np.repeat(np.arange(len(elements)), 4)
-    order = np.lexsort(faces.T)
-    same = (faces[order[1:]] == faces[order[:-1]]).all(axis=1)
-    pairs = np.stack([owner[order[:-1]][same], owner[order[1:]][same]])
-    links = coo_array((np.ones(pairs.shape[1]), pairs), shape=(len(elements), len(elements)))
-    return connected_components(links, directed=False)[1]
+    return connected_parts(np.stack(equal_rows(faces), axis=1) // 4, len(elements))
 
 
 def _diagonal(position: np.ndarray) -> float:

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import Delaunay, cKDTree
 
+from ast_sim.element_topology import triangle_sides
+
 SMOOTHING_ROUNDS = 25
 # Inner nodes start at least this many spacings away from the curves.
 CLEARANCE = 0.65
@@ -142,8 +144,7 @@ def _smoothed(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 
 def _has_rim(triangles: np.ndarray, edges: np.ndarray) -> bool:
     """Whether the given edges are exactly the edges that belong to only one triangle."""
-    sides = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    outline, count = np.unique(sides, axis=0, return_counts=True)
+    outline, count = np.unique(triangle_sides(triangles), axis=0, return_counts=True)
     return np.array_equal(outline[count == 1], np.unique(np.sort(edges, axis=1), axis=0))
 
 

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from ast_sim.element_topology import equal_rows, triangle_sides
 from ast_sim.importers.formats.stl_file import BadSurface, StlFile, read_stl
+from ast_sim.number_arrays import connected_parts
 
 SAME_PLACE = 1e-7  # distance of corners that are one, relative to the diagonal
 CRACKS = (1e-6, 1e-5, 1e-4)  # the same where a surface is open otherwise
@@ -41,8 +41,7 @@ class TriangleSurface:
 
     def edges(self) -> tuple[np.ndarray, np.ndarray]:
         """The edges [n,2], and how many triangles meet at each."""
-        edges = np.sort(self.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-        return np.unique(edges, axis=0, return_counts=True)
+        return np.unique(triangle_sides(self.triangles), axis=0, return_counts=True)
 
     @property
     def is_closed(self) -> bool:
@@ -121,10 +120,8 @@ def _joined(corners: np.ndarray, tolerance: float) -> TriangleSurface:
     points, triangles = _exactly_joined(corners)
     diagonal = float(np.linalg.norm(np.ptp(points, axis=0)))
     pairs = cKDTree(points).query_pairs(tolerance * diagonal, output_type="ndarray")
-    links = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(points), len(points)))
-    _, label = connected_components(links, directed=False)
-    _, first, label = np.unique(label, return_index=True, return_inverse=True)
-    position, triangles = points[first], label[triangles]
+    place = connected_parts(pairs, len(points))
+    position, triangles = points[np.unique(place, return_index=True)[1]], place[triangles]
     points_alone = (triangles == np.roll(triangles, 1, axis=1)).any(axis=1)
     whole, needles = _without_needles(position, triangles[~points_alone])
     kept = _without_folds(whole)
@@ -189,16 +186,8 @@ def _without_folds(triangles: np.ndarray) -> np.ndarray:
 def pieces_of(surface: TriangleSurface) -> np.ndarray:
     """[F]: the piece that each triangle belongs to, from 0, in the order of their first triangles. Triangles that share
     an edge belong to one piece."""
-    edges = np.sort(surface.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    _, number = np.unique(edges, axis=0, return_inverse=True)
-    owner = np.repeat(np.arange(len(surface.triangles)), 3)
-    count = len(surface.triangles)
-    number = number.ravel() + count
-    size = count + len(number)
-    links = coo_array((np.ones(len(owner)), (owner, number)), shape=(size, size))
-    _, label = connected_components(links, directed=False)
-    _, first, label = np.unique(label[:count], return_index=True, return_inverse=True)
-    return np.argsort(np.argsort(first))[label]
+    neighbours = np.stack(equal_rows(triangle_sides(surface.triangles)), axis=1) // 3
+    return connected_parts(neighbours, len(surface.triangles))
 
 
 def solids_of(surface: TriangleSurface) -> np.ndarray:
