@@ -23,7 +23,6 @@ from ast_sim.support.argument_checks import in_short
 from ast_sim.support.errors import ConfigError
 
 KEPT = 0.9  # of the scenes keep the error that was asked for
-FEWEST = math.ceil(1 / (1 - KEPT) - 1e-9) - 1  # scenes, of which none may miss
 DISPLACEMENT = "displacement"  # the quantity that every scene has; what an error is of, if nothing is said
 
 
@@ -60,8 +59,7 @@ class KeptErrors:
         """For each effort the smallest error of a quantity that it keeps; infinite if it keeps none."""
         errors = np.array(self.errors[quantity])
         worst = np.sort(np.maximum.accumulate(errors[::-1])[::-1], axis=1)
-        spared = _allowed(worst.shape[1])  # the number of scenes that may lie above the bound
-        return worst[:, -1 - spared].tolist() if spared >= 0 else [math.inf] * len(worst)
+        return worst[:, -1 - _allowed(worst.shape[1])].tolist()
 
     def effort_for(self, wanted: Mapping[str, float]) -> Effort:
         """The cheapest effort that keeps all wanted errors, by quantity, in 90 % of fresh scenes.
@@ -103,11 +101,6 @@ class KeptErrors:
             raise ConfigError(
                 f"the error of the {quantity} is {in_short(error)}; it must lie between 0 and 1, as 0.02 for 2 %"
             )
-        scenes = len(self.errors[quantity][0])
-        if scenes < FEWEST:
-            raise ConfigError(
-                f"the run can promise no error: it was calibrated with {scenes} scenes, and needs at least {FEWEST}"
-            )
 
 
 def in_words(errors: Mapping[str, float]) -> str:
@@ -116,5 +109,5 @@ def in_words(errors: Mapping[str, float]) -> str:
 
 
 def _allowed(scenes: int) -> int:
-    """How many of `scenes` calibration scenes may miss an effort; negative: there are too few scenes."""
+    """How many of `scenes` calibration scenes may miss an effort; there are at least 9."""
     return math.floor((1 - KEPT) * (scenes + 1) + 1e-9) - 1
