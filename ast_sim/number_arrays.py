@@ -17,8 +17,8 @@ from ast_sim.support.toml_settings import required_whole
 _ELEMENTS_AT_ONCE = 1 << 13
 
 
-def real_numbers(name: str, array: str, value: Any, columns: int | None = None) -> np.ndarray:
-    """Numbers of any real type, an array or lists, as float32; with `columns` as [rows, columns].
+def real_numbers(name: str, array: str, value: Any) -> np.ndarray:
+    """Numbers of any real type, an array or lists, as float32.
 
     Raises:
         DatasetError: these are no numbers, or a finite one is too large for float32; the text names `name` and `array`.
@@ -31,7 +31,6 @@ def real_numbers(name: str, array: str, value: Any, columns: int | None = None) 
     too_large = np.isfinite(given) & ~np.isfinite(single)
     if too_large.any():
         raise DatasetError(f"{name}: {array} holds {given[too_large][0]:g}, which is too large for float32")
-    require_array(name, array, single, np.float32, (None,) * given.ndim if columns is None else (None, columns))
     return single
 
 

@@ -13,7 +13,6 @@ import json
 import logging
 import platform
 import time
-from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -92,14 +91,14 @@ class Watch:
         failures: the samples that failed, with the reason.
     """
 
-    def __init__(self, manifest: Manifest, bar: SceneProgress, clock: Callable[[], float] = time.monotonic) -> None:
-        self.manifest, self.bar, self.clock = manifest, bar, clock
+    def __init__(self, manifest: Manifest, bar: SceneProgress) -> None:
+        self.manifest, self.bar = manifest, bar
         self.failures: dict[Sample, str] = {}
         self._since: dict[Sample, float] = {}
 
     def started(self, sample: Sample, process: int, host: str | None = None) -> None:
         """A process begins to make a sample."""
-        self._since[sample] = self.clock()
+        self._since[sample] = time.monotonic()
         self.bar.begin(sample_name(*sample))
         self.manifest.write(sample, "running", where=f"{host or platform.node()}, process {process}")
 
@@ -125,4 +124,4 @@ class Watch:
         self.bar.tick()
 
     def _seconds(self, sample: Sample) -> float:
-        return self.clock() - self._since.pop(sample, self.clock())
+        return time.monotonic() - self._since.pop(sample, time.monotonic())
