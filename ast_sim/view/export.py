@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import html
 import os
 import shutil
 from collections.abc import Iterator
@@ -79,7 +80,7 @@ def _write_pvd(path: Path, elements: np.ndarray, shown: Fields) -> None:
         for frame, name in enumerate(names):
             _write_vtu(temporary / name, elements, shown, frame)
     lines = [
-        f'    <DataSet timestep="{time!r}" part="0" file="{_escape(folder.name)}/{name}"/>'
+        f'    <DataSet timestep="{time!r}" part="0" file="{html.escape(folder.name)}/{name}"/>'
         for time, name in zip(shown.times.tolist(), names, strict=True)
     ]
     head = '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1" byte_order="LittleEndian">\n  <Collection>'
@@ -178,7 +179,3 @@ def _write_steps(root: h5py.Group, shown: Fields) -> None:
             offsets[name] = start * rows
         for name, values in static.items():
             data[name], offsets[name] = values, zero
-
-
-def _escape(text: str) -> str:
-    return text.replace("&", "&amp;").replace("<", "&lt;").replace('"', "&quot;")

@@ -80,9 +80,9 @@ def test_figures_count_the_deforming_bodies():
 def test_records_of_other_origin_may_be_missing():
     bare = sample()
     assert bare.complete and bare.contact_area is None and bare.total_seconds is None
-    assert bare.numbers("newton_iterations") == bare.per_frame("newton_iterations") == []
+    assert bare.numbers("newton_iterations") == bare.iterations == []
     assert sample(attributes={"contact_area": [0.0, 2.0, 1.0]}).contact_area == 2.0
-    assert sample(attributes={"newton_iterations": [0.0, 3.0, 4.0]}).per_frame("newton_iterations") == [3.0, 4.0]
+    assert sample(attributes={"newton_iterations": [0.0, 3.0, 4.0]}).iterations == [3.0, 4.0]
     assert not sample(attributes={"status": "truncated"}).complete
 
 

@@ -206,7 +206,7 @@ def histograms(samples: Sequence[SampleFigures], length_unit: str) -> list[Json]
         chart("Largest displacement", length_unit, lambda s: [s.displacement], "samples"),
         chart("Largest von Mises stress", "Pa", lambda s: known(s.stress), "samples"),
         chart("Largest contact area", f"{length_unit}²", lambda s: known(s.contact_area), "samples"),
-        chart("Newton iterations", None, lambda s: s.per_frame("newton_iterations"), "frames"),
+        chart("Newton iterations", None, lambda s: s.iterations, "frames"),
         chart("Solver time", "s", lambda s: (s.seconds or [])[1:], "frames"),
         chart("Solver time", "s", lambda s: known(s.total_seconds), "samples"),
         chart("Nodes", None, lambda s: [s.nodes], "samples"),
@@ -301,7 +301,7 @@ def _samples_table(ranked: Sequence[SampleFigures], length_unit: str) -> Json:
         column("Displacement", length_unit, lambda s: s.displacement),
         column("Stress", "Pa", lambda s: s.stress),
         column("Contact area", f"{length_unit}²", lambda s: s.contact_area),
-        column("Iterations", None, lambda s: sum(map(int, s.per_frame("newton_iterations"))) or None),
+        column("Iterations", None, lambda s: sum(map(int, s.iterations)) or None),
         column("Solver time", "s", lambda s: s.total_seconds),
     ]
     return {

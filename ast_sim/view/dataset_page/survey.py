@@ -102,9 +102,10 @@ class SampleFigures:
         imbalance = np.abs(np.diff(work - stored - lost))[loaded]
         return float(np.median(imbalance)) / largest if loaded.any() else 0.0
 
-    def per_frame(self, key: str) -> list[float]:
-        """The numbers of all frames but the first, which is at rest and needs no solving."""
-        return self.numbers(key)[1:]
+    @property
+    def iterations(self) -> list[float]:
+        """The Newton iterations of all frames but the first, which is at rest and needs no solving."""
+        return self.numbers("newton_iterations")[1:]
 
 
 def names(dataset: Dataset) -> list[str]:
