@@ -76,7 +76,7 @@ class Run:
         error = self.expected_error(self.effort)
         return {
             "path": self.path.name,
-            "model": f"{self.settings.model.name}, {sum(p.numel() for p in self.model.parameters()):,} parameters",
+            "model": f"{self.settings.model.name}, {self.model.num_parameters:,} parameters",
             "checkpoint": f"step {self.step:,}",
             "family": f"{self.scope.family}, lengths in {self.scope.length_unit}",
             "effort": self.effort.text,

@@ -95,6 +95,11 @@ class Simulator(nn.Module):
         reactions = any(name == REACTION for name, *_ in config.data.fields)
         self.force_normalizer = Normalizer("vector") if reactions else None
 
+    @property
+    def num_parameters(self) -> int:
+        """The number of weights."""
+        return sum(weights.numel() for weights in self.parameters())
+
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Simulator:
         try:
             device = fn(torch.empty(0)).device

@@ -164,7 +164,7 @@ def write(path: Path, run: RunFolder, model: Simulator, effort: Mapping[str, Any
     }
     weights = {key: tensor.detach().clone().contiguous() for key, tensor in model.state_dict().items()}
     members = {
-        _CARD: card(path.stem, without_path, run.scope, chosen, sum(p.numel() for p in model.parameters())).encode(),
+        _CARD: card(path.stem, without_path, run.scope, chosen, model.num_parameters).encode(),
         _LICENCE: (licence or run.licence or _NO_LICENCE).encode(),
         _FACTS: json.dumps(facts, indent=1, allow_nan=False).encode(),
         METRICS: "".join(map(seal, run.metrics)).encode(),

@@ -9,10 +9,8 @@ import signal
 import sys
 from collections.abc import Callable
 
-from torch import nn
-
 from ast_sim.dataset.reader import Dataset
-from ast_sim.models.simulator import FIELD
+from ast_sim.models.simulator import FIELD, Simulator
 from ast_sim.named_field import STRESS
 from ast_sim.runs.metrics import Metrics
 from ast_sim.runs.train_config import RunConfig
@@ -26,7 +24,7 @@ from ast_sim.training.rates import learning_rate
 CONSTANT = 1e-3
 
 
-def introduction(model: nn.Module, config: RunConfig, dataset: Dataset, scales: DataScales, pairs: int) -> list[str]:
+def introduction(model: Simulator, config: RunConfig, dataset: Dataset, scales: DataScales, pairs: int) -> list[str]:
     """Lines with the sizes of the model and the data, the number of steps, and the noise relative to lengths of the
     data."""
     options, unit = config.train, dataset.info.length_unit
@@ -35,7 +33,7 @@ def introduction(model: nn.Module, config: RunConfig, dataset: Dataset, scales: 
     rms, spacing = max(scales.increment, 1e-300), max(scales.spacing, 1e-300)
     used = f"{scales.trajectories:,}" if options.scenes is None else f"{options.scenes:,} of {scales.trajectories:,}"
     return [
-        f"parameters  {sum(p.numel() for p in model.parameters()):,}",
+        f"parameters  {model.num_parameters:,}",
         f"data        {used} scenes of about {scales.nodes:,} nodes, {pairs:,} pairs",
         f"steps       {options.steps:,} of {scenes} scenes each: {epochs:.3g} epochs",
         f"noise       {options.noise:.3g} {unit} = {options.noise / rms:.2g} x rms increment"

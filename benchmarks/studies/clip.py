@@ -100,7 +100,7 @@ def measured(plan: Plan, folder: Path) -> dict[str, Any]:
             for split in ("train", "valid", "test", "calibration")
         },
         "training_seconds": 60 * minutes_per_step(run) * plan.steps,
-        "parameters": sum(weights.numel() for weights in run.model.parameters()),
+        "parameters": run.model.num_parameters,
         "scenes": scenes,
         "unseen": unseen,
         "variants": clip_variants.solved(beside, plan.nodes, folder / "variants.json"),

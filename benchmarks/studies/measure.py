@@ -97,7 +97,7 @@ def measure(run: Run, horizons: int, command: str) -> dict[str, Any]:
             farthest = max(farthest, reach[0] / reach[1])
     return {
         **found,
-        "parameters": sum(p.numel() for p in run.model.parameters()),
+        "parameters": run.model.num_parameters,
         "phases": {
             name: {"rmse_sequence": rmse_sequence(list_), "rmse_pooled": rmse_pooled(list_)}
             for name, list_ in errors.items()

@@ -102,7 +102,7 @@ class Evaluation:
         run, info = self.run, dataset.info
         training, model = run.settings.train, run.settings.model
         facts = {
-            "Model": f"{type(run.model).__name__}, {sum(p.numel() for p in run.model.parameters()):,} parameters",
+            "Model": f"{type(run.model).__name__}, {run.model.num_parameters:,} parameters",
             **model.facts(info.length_unit),
             "Training": f"{training.steps:,} steps of {training.batch_size * training.accumulate} scenes,"
             f" seed {training.seed}",
