@@ -82,6 +82,12 @@ def triangle_sides(triangles: np.ndarray) -> np.ndarray:
     return np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
 
 
+def unit_normals(corners: np.ndarray) -> np.ndarray:
+    """[F, 3] of length one, for triangles with these corners [F, 3, 3]; 0 for a triangle without an area."""
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), np.finfo(normal.dtype).tiny)
+
+
 def equal_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The numbers of rows [n, k] that are equal, as pairs: each such row but the last with the next one like it."""
     order = np.lexsort(rows.T)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ast_sim.element_topology import surface_triangles
+from ast_sim.element_topology import surface_triangles, unit_normals
 from ast_sim.mesh_arrays import NodeType
 
 MOST_TRIANGLES = 6000  # a drawing of more would be megabytes
@@ -12,6 +12,7 @@ WIDTH, HEIGHT = 360, 260
 BODY_COLORS = ((76, 139, 201), (224, 160, 60), (90, 168, 118), (176, 124, 198), (201, 106, 90), (127, 140, 153))
 EYE = np.array([-0.62, -1.32, 0.78])  # from where a solid scene is seen, in units of its diagonal
 LIGHT = np.array([-0.35, -0.45, 0.82])
+LIGHT /= np.linalg.norm(LIGHT)
 
 
 def scene_facts(
@@ -43,15 +44,13 @@ def scene_drawing(position: np.ndarray, elements: np.ndarray, node_type: np.ndar
     right, up, forward = _axes(planar)
     corners = position[surface].astype(np.float64)  # [F, 3, 3]
     flat = np.stack([corners @ right, corners @ up], axis=2)
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    length = np.linalg.norm(normal, axis=1)
-    cosine = np.abs(normal @ (LIGHT / np.linalg.norm(LIGHT))) / np.where(length == 0, 1, length)
+    normal = unit_normals(corners)
     facing = np.ones(len(surface), bool) if elements.shape[1] == 3 else normal @ forward < 0
     low, high = flat.min(axis=(0, 1)), flat.max(axis=(0, 1))
     scale = min((WIDTH - 10) / max(high[0] - low[0], 1e-30), (HEIGHT - 10) / max(high[1] - low[1], 1e-30))
     pixels = np.round(5 + (flat - low) * scale, 1)
     pixels[:, :, 1] = np.round(10 + scale * (high[1] - low[1]), 1) - pixels[:, :, 1]
-    shade = 0.6 + 0.4 * cosine
+    shade = 0.6 + 0.4 * np.abs(normal @ LIGHT)
     rigid = (node_type[surface] == NodeType.OBSTACLE).any(axis=1)
     lines = []
     for triangle in np.argsort(-(corners.mean(axis=1) @ forward), kind="stable"):

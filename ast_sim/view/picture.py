@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ast_sim.element_topology import unit_normals
 from ast_sim.scene import Trajectory
 from ast_sim.scene_summary import EYE, LIGHT
 from ast_sim.support.disk import replacing
@@ -178,10 +179,7 @@ def _draw(axes, view: View, position: np.ndarray, color_map, values: np.ndarray)
 
 def shade(corners: np.ndarray) -> np.ndarray:
     """[F]: Lambert's law with so much ambient light that colours can still be compared with the scale."""
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    length = np.linalg.norm(normal, axis=1)
-    cosine = normal @ (LIGHT / np.linalg.norm(LIGHT)) / np.where(length == 0, 1, length)
-    return 0.74 + 0.26 * np.clip(np.abs(cosine), 0, 1)
+    return 0.74 + 0.26 * np.minimum(np.abs(unit_normals(corners) @ LIGHT), 1)
 
 
 def _subdivision() -> np.ndarray:

@@ -13,7 +13,7 @@ from typing import TextIO
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ast_sim.element_topology import equal_rows, triangle_sides
+from ast_sim.element_topology import equal_rows, triangle_sides, unit_normals
 from ast_sim.mechanics.case import SolidCase
 from ast_sim.mechanics.driven import Driven
 from ast_sim.scene import Scene
@@ -183,8 +183,7 @@ def slave_first(scene: Scene, one: int, other: int) -> tuple[int, int]:
 def _convex_angle(position: np.ndarray, faces: np.ndarray, near: np.ndarray) -> float:
     """Largest angle in radian between the normals on both sides of a convex edge at one of the nodes `near` [N]."""
     corners = position[faces]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    normal = unit_normals(corners)
     edges = triangle_sides(faces)
     first, second = equal_rows(edges)
     concerned = near[edges[first]].any(axis=1)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import coo_array, csr_array
 
-from ast_sim.element_topology import LOCAL_EDGES
+from ast_sim.element_topology import LOCAL_EDGES, unit_normals
 from ast_sim.mechanics.case import SolidCase
 from ast_sim.number_arrays import point
 from ast_sim.simulate.own_assembly.assembly_spec import AssemblySpec
@@ -89,8 +89,7 @@ def _across(rest: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray
     import igl  # takes 0.2 s
 
     corners = rest[faces]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), np.finfo(float).tiny)
+    normal = unit_normals(corners)
     middle = corners.mean(axis=1)
     inward = INWARD * np.linalg.norm(np.ptp(corners, axis=(0, 1)))
     tree = igl.AABB()
