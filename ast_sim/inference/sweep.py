@@ -15,6 +15,7 @@ from ast_sim.inference.promises.chosen_effort import ErrorLimit
 from ast_sim.mechanics.linearised_contact import STILL
 from ast_sim.models.model_config import ModelConfig
 from ast_sim.runs.scope import Scope
+from ast_sim.simulate.own_assembly.parameters import flattened
 from ast_sim.support.argument_checks import file_name
 from ast_sim.support.errors import ConfigError, warn
 from ast_sim.support.progress import Progress, ShowProgress
@@ -132,10 +133,5 @@ def _row(values: Mapping[str, Any], answer: Answer, origin: Sequence[float]) -> 
 def _varied(rows: Sequence[Mapping[str, Any]], table: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
     """The names, in the order in which the user gave them."""
     first = table[0]
-    given = {
-        part: None
-        for row in rows
-        for name, value in row.items()
-        for part in ([f"{one}.{name}" for one in value] if isinstance(value, Mapping) else [name])
-    }
+    given = dict.fromkeys(name for row in rows for name, _ in flattened(row))
     return tuple(name for name in given if any(row[name] != first[name] for row in table))

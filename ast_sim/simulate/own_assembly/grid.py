@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from ast_sim.simulate.own_assembly.parameters import flattened
 from ast_sim.support.argument_checks import file_name, require_type
 from ast_sim.support.disk import read_text
 from ast_sim.support.errors import ConfigError
@@ -70,14 +71,12 @@ def grid(values: Mapping[str, Any]) -> list[dict[str, Any]]:
     """
     require_type("parameters", values, Mapping, "values by name, such as {'travel': [1, 2]}")
     flat: dict[str, Sequence[Any]] = {}
-    for name, value in values.items():
-        inner = {f"{part}.{name}": v for part, v in value.items()} if isinstance(value, Mapping) else {name: value}
-        for key, v in inner.items():
-            if key in flat:
-                raise ConfigError(f"{key} is given twice: leave one out")
-            flat[key] = [v] if isinstance(v, str) or np.ndim(v) == 0 else list(v)
-            if not len(flat[key]):
-                raise ConfigError(f"{key} has no value")
+    for name, value in flattened(values):
+        if name in flat:
+            raise ConfigError(f"{name} is given twice: leave one out")
+        flat[name] = [value] if isinstance(value, str) or np.ndim(value) == 0 else list(value)
+        if not len(flat[name]):
+            raise ConfigError(f"{name} has no value")
     count = math.prod(len(v) for v in flat.values())
     if count > MOST_ROWS:
         raise ConfigError(f"the grid has {count:,} rows; at most {MOST_ROWS:,}: take fewer values")

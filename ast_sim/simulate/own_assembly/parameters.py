@@ -7,7 +7,7 @@ Sobol sequence, whose points fill the ranges evenly however many of them are tak
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -145,9 +145,7 @@ def completed(parameters: Mapping[str, Parameter], given: Mapping[str, Any]) -> 
     Raises:
         ConfigError: there is no such parameter (the text names the nearest one), or a value does not fit.
     """
-    flat: dict[str, Any] = {}
-    for name, value in given.items():
-        flat |= {f"{part}.{name}": v for part, v in value.items()} if isinstance(value, Mapping) else {name: value}
+    flat = dict(flattened(given))
     for name in flat:
         if name not in parameters:
             raise ConfigError(f"there is no parameter {name!r}{nearest_name(name, parameters)}")
@@ -160,6 +158,15 @@ def completed(parameters: Mapping[str, Parameter], given: Mapping[str, Any]) -> 
         else:
             values[name] = one.formula(values)
     return values
+
+
+def flattened(given: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Values by the names of their parameters, where a quantity of several parts may be given as a mapping by part."""
+    for name, value in given.items():
+        if isinstance(value, Mapping):
+            yield from ((f"{part}.{name}", one) for part, one in value.items())
+        else:
+            yield name, value
 
 
 def recorded(values: Values) -> dict[str, Any]:
