@@ -21,7 +21,7 @@ from ast_sim.inference.answering import answers
 from ast_sim.inference.effort import Effort, EffortErrors
 from ast_sim.inference.predicting.jump import answer_steps
 from ast_sim.inference.predicting.question import Question
-from ast_sim.inference.quantities.relative_errors import relative_error, rms, stress_errors
+from ast_sim.inference.quantities.relative_errors import displacement, relative_error, stress_errors
 from ast_sim.mechanics.linearised_contact import STILL
 from ast_sim.models.simulator import Simulator
 from ast_sim.number_arrays import percent
@@ -113,7 +113,7 @@ def errors_by_effort(model: Simulator, truth: Trajectory, efforts: Sequence[Effo
     """The errors at the deepest frame after each number of Newton steps up to the one of each effort; empty where
     nothing is displaced."""
     frame = deepest_predicted(model, truth)
-    if not rms(truth.position[frame] - truth.position[0], ~truth.scene.prescribed):
+    if not displacement(truth, frame):
         return []
     return [errors for effort in efforts for errors in _after(model, truth, frame, effort)]
 
@@ -193,7 +193,7 @@ def _scene(model: Simulator, dataset: Dataset, split: str, index: int, effort: E
     frame = deepest_predicted(model, truth)
     question = Question.of(truth, name, [frame])
     (answer,) = answers(model, [question], effort)
-    size = rms(truth.position[frame] - truth.position[0], ~truth.scene.prescribed)
+    size = displacement(truth, frame)
     failed = answer.failure is not None or not size  # where nothing moves, there is no relative error
     stress = None if answer.stress is None or answer.failure is not None else answer.stress[0]
     by_calls = []

@@ -25,9 +25,12 @@ SAME = 1e-4  # of the size of a scene: positions that are no farther apart diffe
 def relative_error(position: np.ndarray, truth: Trajectory, frame: int) -> float:
     """The root mean square error of the free nodes at positions [N, 3] in a frame, divided by the root mean square of
     their displacement, which must not be 0."""
-    free = ~truth.scene.prescribed
-    true = truth.position[frame]
-    return rms(position - true, free) / rms(true - truth.position[0], free)
+    return rms(position - truth.position[frame], ~truth.scene.prescribed) / displacement(truth, frame)
+
+
+def displacement(truth: Trajectory, frame: int) -> float:
+    """The root mean square of the displacement of the free nodes in a frame."""
+    return rms(truth.position[frame] - truth.position[0], ~truth.scene.prescribed)
 
 
 def moves(truth: Trajectory) -> bool:
