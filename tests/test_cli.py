@@ -487,7 +487,7 @@ def test_a_report_is_html_and_its_name_says_so(trained, tmp_path, capsys):
     assert "rr.pdf: the name of a page must end in .html or .htm" in error
     with pytest.raises(AstSimError, match="must end in"):
         gallery.write(tmp_path / "rr", trained[0])
-    for write in (Trade({}).report, lambda path: report_evaluations(path, [None], "a title")):
+    for write in (Trade({}).report, lambda path: report_evaluations(path, [None])):
         with pytest.raises(AstSimError, match="must end in"):
             write(tmp_path / "a folder" / "rr.pdf")
     assert os.listdir(tmp_path) == []

@@ -17,7 +17,6 @@ import ast_sim
 from ast_sim import Effort, Material, Motion, Scene
 from ast_sim.support.argument_checks import file_name, in_short, require_bool, several
 from ast_sim.support.errors import AstSimError, ConfigError, DatasetError
-from ast_sim.view import page
 
 PRESS = {1: (0, 0, -0.01)}
 POINTS, CELLS = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 1, 2, 3]]
@@ -346,7 +345,6 @@ def test_arguments_of_long_work(data, run, answer, tmp_path, tmp_path_factory):
             lambda: run.evaluate(data, solver_scenes=0, made_from="spec.toml"),
             "made_from is for the solver: give solver_scenes",
         ),
-        (lambda: page.write(tmp_path / "a.html", {}, 5), "title is 5; it must be a text"),
         (lambda: run.evaluate(data, command=5), "command is 5; it must be a text"),
         (lambda: ast_sim.trade(run, command=5), "command is 5; it must be a text"),
         (lambda: ast_sim.trade(run, solver_seconds=1, made_from="spec.toml"), "made_from is for our solver"),

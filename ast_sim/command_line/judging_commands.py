@@ -127,5 +127,5 @@ def report(args: argparse.Namespace) -> None:
         from ast_sim.inference.evaluation.evaluated_run import report_evaluations
 
         evaluations = [open_run(folder).evaluate(args.data, command=args.command_line) for folder in args.shown]
-        report_evaluations(args.out, evaluations, "Learned simulation: predictions and errors")
+        report_evaluations(args.out, evaluations)
     print(f"report: {args.out}")

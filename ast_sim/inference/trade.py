@@ -71,7 +71,7 @@ class Trade:
         """Write all figures as JSON."""
         write_json(file_name(path, "path"), self.to_json())
 
-    def report(self, path: str | os.PathLike[str], title: str = "Speed against accuracy") -> None:
+    def report(self, path: str | os.PathLike[str]) -> None:
         """Write a page: error against seconds, and the tables; a missing folder is made.
 
         Raises:
@@ -79,7 +79,7 @@ class Trade:
             MissingExtra: plotly is not installed.
         """
         make_folder(page_name(path).parent)
-        trade_page.write(path, list(self.by_quantity.values()), title)
+        trade_page.write(path, list(self.by_quantity.values()), "Speed against accuracy")
 
 
 def trade(

@@ -15,7 +15,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from ast_sim.support.argument_checks import file_name, require_type
+from ast_sim.support.argument_checks import file_name
 from ast_sim.support.disk import replacing
 from ast_sim.support.errors import AstSimError, require
 from ast_sim.view.files import explained
@@ -45,7 +45,6 @@ def write(path: str | os.PathLike[str], data: dict[str, Any], title: str) -> Non
         MissingExtra: plotly is not installed.
     """
     path = page_name(path)
-    require_type("title", title, str, "a text")
     text = render(data, title)
     with explained(path), replacing(path) as temporary:
         # Names of files may hold bytes that are no text; their escapes are valid in JSON, too.

@@ -63,9 +63,9 @@ class Evaluation:
         """Write all figures as JSON."""
         write_json(file_name(path, "path"), self.figures.to_json())
 
-    def report(self, path: str | os.PathLike[str], title: str = "Learned simulation: predictions and errors") -> None:
+    def report(self, path: str | os.PathLike[str]) -> None:
         """Write a page with moving scenes, errors, times and settings."""
-        report_evaluations(path, [self], title)
+        report_evaluations(path, [self])
 
     def content(self) -> tuple[str, str]:
         """What the dataset holds, as a hash, and the split."""
@@ -115,7 +115,7 @@ class Evaluation:
         return facts | {f"Generator {key}": str(value) for key, value in plain.items()}
 
 
-def report_evaluations(path: str | os.PathLike[str], evaluations: list[Evaluation], title: str) -> None:
+def report_evaluations(path: str | os.PathLike[str], evaluations: list[Evaluation]) -> None:
     """Write one page that shows several runs side by side; a missing folder is made.
 
     Raises:
@@ -123,7 +123,7 @@ def report_evaluations(path: str | os.PathLike[str], evaluations: list[Evaluatio
     """
     _require_one_dataset(evaluations)
     make_folder(page_name(path).parent)
-    report.write(path, [evaluation.shown() for evaluation in evaluations], title)
+    report.write(path, [evaluation.shown() for evaluation in evaluations], "Learned simulation: predictions and errors")
 
 
 def _require_one_dataset(evaluations: Sequence[Evaluation]) -> None:
