@@ -1,10 +1,10 @@
 """What an evaluation of a run measures, as typed records that are written as JSON.
 
 Errors are root mean square errors of a `quantity` ("displacement" in the unit of length, "stress" in pascal, or a named
-field in its unit) that a
-`predictor` made ("model", or a trivial one such as "hold_still") over a `horizon` ("one_step": each frame from the true
-frame before it; "rollout_50", "rollout_all": the first 50 frames, all frames from the given ones) on some `nodes`
-("normal", "all"; for the stress and named fields "deforming", for reactions "prescribed").
+field in its unit) that a `predictor` made ("model", or a trivial one such as "hold_still") over a `horizon`
+("one_step": each frame from the true frame before it; "rollout_50", "rollout_all": the first 50 frames, all frames from
+the given ones) on some `nodes` ("normal", "all"; for the stress and named fields "deforming", for reactions
+"prescribed").
 """
 
 from __future__ import annotations
