@@ -24,9 +24,9 @@ def real_numbers(name: str, array: str, value: Any) -> np.ndarray:
         DatasetError: these are no numbers, or a finite one is too large for float32; the text names `name` and `array`.
     """
     given = _as_array(name, array, value)
-    if given.dtype.kind not in "fiub":
+    if given.dtype.kind not in "fiu":
         raise DatasetError(f"{name}: {array} must be numbers, not {given.dtype}")
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore", under="ignore"):
         single = np.array(given, np.float32, order="C")
     too_large = np.isfinite(given) & ~np.isfinite(single)
     if too_large.any():
@@ -53,7 +53,7 @@ def whole_numbers(name: str, array: str, value: Any, dtype: type) -> np.ndarray:
         DatasetError: one is not whole, or does not fit into the type; the text names `name`, `array` and the number.
     """
     given = _as_array(name, array, value)
-    if given.dtype.kind not in "fiub":
+    if given.dtype.kind not in "fiu":
         raise DatasetError(f"{name}: {array} must be whole numbers, not {given.dtype}")
     limits = np.iinfo(dtype)
     wrong = ~((given == np.round(given)) & (given >= limits.min) & (given <= limits.max))
@@ -72,6 +72,11 @@ def _as_array(name: str, array: str, value: Any) -> np.ndarray:
         return np.asarray(value)
     except ValueError as error:  # rows of different lengths
         raise DatasetError(f"{name}: {array} must be an array: {error}") from error
+    except (TypeError, RuntimeError) as error:  # a tensor of torch that has gradients, or is no plain array of numbers
+        why = str(error).splitlines()[0]
+        raise DatasetError(
+            f"{name}: {array} is no array of NumPy: hand over .detach().float().numpy() ({why})"
+        ) from error
 
 
 def connected_parts(elements: np.ndarray, num_nodes: int) -> np.ndarray:

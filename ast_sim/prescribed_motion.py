@@ -316,8 +316,8 @@ def _numbers(value: object) -> np.ndarray:
     """Real numbers as float64; NaN in place of what is none."""
     try:
         given = np.asarray(value)
-        return given.astype(np.float64) if given.dtype.kind in "fiubO" else np.full(given.shape, np.nan)
-    except (TypeError, ValueError, OverflowError):  # rows of different lengths, or objects that are no numbers
+        return given.astype(np.float64) if given.dtype.kind in "fiuO" else np.full(given.shape, np.nan)
+    except (TypeError, ValueError, OverflowError, RuntimeError):  # rows of different lengths, or what is no numbers
         return np.array(np.nan)
 
 

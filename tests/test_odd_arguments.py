@@ -10,6 +10,7 @@ from pathlib import Path
 import meshio
 import numpy as np
 import pytest
+import torch
 import toy
 from meshes import plate_and_punch
 
@@ -61,6 +62,33 @@ def test_the_checks_by_hand(tmp_path):
     refused(lambda: require_bool(throw=1), "throw is 1; it must be True or False")
     for value in (5, None, "", b"a", "a\0b", ["a"]):
         refused(lambda value=value: file_name(value, "out"), f"out is {in_short(value)}; it {NO_NAME}")
+
+
+def test_tensors_of_torch_are_read_or_refused(run, scene):
+    points = torch.from_numpy(np.array(scene.rest_position))
+    for kind in (points, points.double()):
+        made = Scene.of(kind, scene.elements, node_type=scene.node_type, body=scene.body)
+        np.testing.assert_array_equal(made.rest_position, scene.rest_position)
+    for kind in (points.bfloat16(), points.clone().requires_grad_(), points.to("meta"), points.to_sparse()):
+        refused(
+            lambda kind=kind: Scene.of(kind, scene.elements), "scene: points is no array of NumPy: hand over .detach"
+        )
+        refused(
+            lambda kind=kind: run.predict(scene, kind[None]), "the motion: position is no array of NumPy: hand over"
+        )
+
+
+def test_truth_values_are_no_numbers(run, scene):
+    kinds = {"node_type": scene.prescribed, "body": scene.prescribed}  # True is no NodeType, though it equals OBSTACLE
+    for name, kind in kinds.items():
+        refused(
+            lambda name=name, kind=kind: Scene.of(scene.rest_position, scene.elements, **{name: kind}),
+            f"scene: {name} must be whole numbers, not bool",
+        )
+    refused(lambda: run.predict(scene, {1: (False, False, True)}), "translation of a motion must be three numbers or")
+    refused(lambda: ast_sim.RigidMotion(rotation=True), "rotation of a motion must be one number")
+    moved = torch.tensor((0, 0, -0.01), requires_grad=True)
+    refused(lambda: ast_sim.RigidMotion(moved), "translation of a motion must be three numbers or")
 
 
 @pytest.mark.parametrize("kind", ["a mesh", "plates.h5", 5, [], np.zeros((3, 3)), Scene, {}])

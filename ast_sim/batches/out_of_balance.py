@@ -69,7 +69,7 @@ class ElasticTetrahedra:
         if corners == 10:
             volume = volume / 8  # of an eighth, whose edges are as long as nodes are apart
         share = torch.from_numpy(np.repeat((young * volume ** (2 / 3)).astype(np.float32), corners))
-        force = torch.zeros(scene.num_nodes).index_add_(0, elements.reshape(-1), share)
+        force = torch.zeros(scene.num_nodes, dtype=torch.float32).index_add_(0, elements.reshape(-1), share)
         if corners == 4:
             return ElasticTetrahedra(TetrahedronSet.from_elements(elements, scene.num_nodes), lame, force)
         lame[:, 0] = torch.minimum(lame[:, 0], LARGEST * lame[:, 1])  # as the points of the solver's elements

@@ -16,6 +16,7 @@ from ast_sim.batches.carry import Carrier
 from ast_sim.batches.graph import Graph
 from ast_sim.batches.mirror_and_shift import Placement
 from ast_sim.batches.scheme import Scheme
+from ast_sim.batches.torch_settings import tensors_on_cpu
 from ast_sim.dataset.reader import Dataset
 from ast_sim.named_field import STRESS, require_fields
 from ast_sim.scene import Scene
@@ -174,9 +175,10 @@ class PairSampler:
         """One pair of all, as a batch of its own. Its noise and its placement are new at each call; the seed of torch
         determines them."""
         number = range(len(self))[number]  # an IndexError where there is none ends a loop over all
-        return self._built(self._pair(int(torch.randint(_LARGEST_SEED, ())), number))
+        return self._built(self._pair(int(torch.randint(_LARGEST_SEED, (), device="cpu")), number))
 
     @staticmethod
+    @tensors_on_cpu()
     def collate(pairs: Sequence[tuple[Batch, Target]]) -> tuple[Batch, Target]:
         """Several pairs as one batch."""
         batches, targets = zip(*pairs, strict=True)
@@ -239,6 +241,7 @@ class PairSampler:
         """The batch of these pairs. Their errors are added only where noise would be."""
         return self.collate([self._built(pair) for pair in pairs])
 
+    @tensors_on_cpu()
     def _built(self, pair: Pair | Jump) -> tuple[Batch, Target]:
         """The batch of one pair, mirrored and moved."""
         member = self._member(pair.index)
@@ -301,6 +304,7 @@ class PairSampler:
     def _member(self, index: int) -> _Member:
         return self._members.get(index, lambda: self._make_member(index))
 
+    @tensors_on_cpu()
     def _make_member(self, index: int) -> _Member:
         scene = self._dataset.scene(self._split, index)
         noisy = np.repeat(~scene.prescribed[:, None], 3, axis=1).astype(np.float32)

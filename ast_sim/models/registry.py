@@ -7,6 +7,10 @@ from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 
+import torch
+from torch import Tensor
+
+from ast_sim.batches.torch_settings import float32_layers, usual_settings
 from ast_sim.models.model_config import ModelConfig, Preset
 from ast_sim.models.simulator import Simulator
 from ast_sim.support.errors import ConfigError, nearest_name
@@ -79,8 +83,18 @@ def find_preset(model: str, preset: str) -> Preset:
 
 
 def build_model(config: ModelConfig) -> Simulator:
-    """The model of resolved settings."""
-    return find_model(config.name).simulator(config)
+    """The model of resolved settings, in float32 on the CPU, with random weights."""
+    simulator = find_model(config.name).simulator
+    with usual_settings(), float32_layers():
+        return simulator(config)
+
+
+def trained_model(config: ModelConfig, weights: Mapping[str, Tensor]) -> Simulator:
+    """The model of resolved settings with these weights, for predictions. No random number of the program is drawn."""
+    with torch.random.fork_rng(devices=[]):
+        model = build_model(config)
+    model.load_state_dict(weights)
+    return model.eval()
 
 
 def _missing(what: str, name: str, known: Iterable[str]) -> ConfigError:

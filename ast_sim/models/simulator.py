@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from ast_sim.batches.batch_builder import Batch, Target
 from ast_sim.batches.graph import Graph
 from ast_sim.batches.pairs import PairSampler
+from ast_sim.batches.torch_settings import tensors_on_cpu, usual_settings
 from ast_sim.dataset.reader import Dataset
 from ast_sim.element_topology import LOCAL_EDGES
 from ast_sim.models.data_facts import DataFacts
@@ -102,7 +103,7 @@ class Simulator(nn.Module):
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Simulator:
         try:
-            device = fn(torch.empty(0)).device
+            device = fn(torch.empty(0, device="cpu")).device
         except (AssertionError, RuntimeError) as error:  # torch has no such device here
             raise ConfigError(f"{_CPU_ONLY}: {str(error).splitlines()[0]}") from None
         _require_cpu("the model", device)
@@ -110,7 +111,8 @@ class Simulator(nn.Module):
 
     def __call__(self, batch: Batch) -> Prediction:
         _require_cpu("the batch", batch.position.device)
-        return super().__call__(batch)
+        with tensors_on_cpu():
+            return super().__call__(batch)
 
     def forward(self, batch: Batch) -> Prediction:
         raise NotImplementedError
@@ -184,6 +186,7 @@ class Simulator(nn.Module):
         mean = total / count
         return (normalizer.inverse(said - mean) + self.force_normalizer.inverse(mean) / count).float()
 
+    @tensors_on_cpu()
     @torch.no_grad()
     def fit_statistics(self, batches: Iterable[tuple[Batch, Target]]) -> None:
         """Fix the statistics of inputs and targets, in float64, from batches as in training, with noise."""
@@ -203,6 +206,7 @@ class Simulator(nn.Module):
             if isinstance(module, Normalizer):
                 module.fix()
 
+    @tensors_on_cpu()
     def loss(
         self,
         prediction: Prediction,
@@ -273,7 +277,7 @@ class Simulator(nn.Module):
         if training:  # each of its modules is told, so only if it must be
             self.eval()
         try:
-            with torch.inference_mode():
+            with usual_settings(), torch.inference_mode():
                 yield
         finally:
             if training:
@@ -313,7 +317,7 @@ def _strains(graph: Graph, motion: Tensor) -> Tensor:
     """[E, K, 3]: the differences of a motion [N, 3] along the K edges of each deforming element, over their lengths at
     rest; 0 along an edge without length."""
     nodes = graph.elements[graph.deforming_elements]
-    first, second = torch.tensor(LOCAL_EDGES[nodes.shape[1]]).T
+    first, second = torch.tensor(LOCAL_EDGES[nodes.shape[1]], device="cpu").T
 
     def along_edges(values: Tensor) -> Tensor:
         at_nodes = values.index_select(0, nodes.flatten()).view(*nodes.shape, 3)

@@ -155,11 +155,11 @@ class Transolver(Simulator):
 
     def graph(self, scene: Scene) -> Graph:
         """See `Simulator`. It has no edges."""
-        return replace(super().graph(scene), m2m=None, rest_edges=torch.empty(0, 4))
+        return replace(super().graph(scene), m2m=None, rest_edges=torch.empty(0, 4, dtype=torch.float32))
 
     def inputs_of(self, batch: Batch, use: Use = Normalizer.__call__) -> tuple[Tensor, Tensor]:
         """See `Simulator`: of the nodes, and their positions at rest and now from the centre of the domain, [N, 6]."""
-        center = torch.tensor(self.config.data.domain_center * 2)
+        center = batch.position.new_tensor(self.config.data.domain_center * 2)
         positions = torch.cat([batch.graph.rest_position, batch.position], dim=1) - center
         return use(self.node_inputs, node_features(self.config, batch)), use(self.positions, positions)
 

@@ -16,7 +16,7 @@ from ast_sim.batches.frame_pairs import target_counts
 from ast_sim.dataset.reader import Dataset
 from ast_sim.number_arrays import percent
 from ast_sim.planning.forecast import Forecast, forecast
-from ast_sim.planning.trials import GROWTH, LONGEST, MINUTES, Trial, Trials, candidates, round_sizes
+from ast_sim.planning.trials import GROWTH, LONGEST, MINUTES, Trial, Trials, candidates, round_sizes, trial_folder
 from ast_sim.runs.config_toml import write_settings
 from ast_sim.runs.train_config import RunConfig
 from ast_sim.support.argument_checks import file_name, require_type
@@ -125,6 +125,7 @@ def planned(
     """`plan` for settings as `train` has them."""
     require_type("minutes", minutes, Real, "a number")
     require_range("minutes", minutes, *MINUTES)
+    out = trial_folder(out)
     _require_open(config)
     scenes, valid, pairs = _counted(config)
     config = _with_processes(config, minutes)

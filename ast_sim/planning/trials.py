@@ -7,15 +7,19 @@ are compared take equal minutes. Each one is a run in a folder, so a plan that w
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+import os
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ast_sim.runs.config_toml import has_config
 from ast_sim.runs.folder import RunFolder
 from ast_sim.runs.train_config import RunConfig
+from ast_sim.support.argument_checks import file_name
 from ast_sim.support.errors import ConfigError, TrainingError
+from ast_sim.training.callbacks import Callback
 from ast_sim.training.start import start_training
 
 GROWTH = 3  # steps of a trial, as a multiple of a trial's steps in the round before
@@ -26,6 +30,7 @@ WIDER = 1.5  # times the width of the preset
 WIDTHS = ("hidden", "decoder_hidden", "d_token", "heads", "ffn_inner")  # settings of models that a width consists of
 MINUTES = (1e-3, 1e7)  # that a training may take
 TIMED = 50  # steps whose time tells how many fit into a trial
+FEW = 10  # steps that are enough to know that not half of `LEAST` will fit
 LEAST = 20  # steps of a trial of the first round: from fewer nothing is learnt
 VALIDATION_SCENES = 40  # at most, of a trial
 
@@ -74,6 +79,18 @@ def round_sizes(candidates: int) -> list[int]:
     return sizes
 
 
+class _TooSlow(Exception):
+    """Steps of which far too few fit into a trial; its argument is the seconds of one."""
+
+
+def trial_folder(out: str | os.PathLike[str]) -> Path:
+    """The folder for trials; a ConfigError if it holds a run itself."""
+    folder = file_name(out, "out")
+    if has_config(folder):
+        raise ConfigError(f"{folder} holds a run: choose another folder, in which the trials are made")
+    return folder
+
+
 class Trials:
     """Trains candidates in a folder; what is there already is not trained again.
 
@@ -87,8 +104,10 @@ class Trials:
         self.scenes = scenes
         self.valid = min(valid, VALIDATION_SCENES)
 
-    def trained(self, name: str, config: RunConfig, steps: int, scenes: int | None = None) -> Trial:
-        """Train a candidate for `steps` steps, on all training scenes or on the first ones.
+    def trained(
+        self, name: str, config: RunConfig, steps: int, scenes: int | None = None, callback: Callback | None = None
+    ) -> Trial:
+        """Train a candidate for `steps` steps, on all training scenes or on the first ones; `callback` as for `train`.
 
         Raises:
             TrainingError: the validation failed, or as `start_training`.
@@ -107,7 +126,8 @@ class Trials:
         )
         about = f"{name}, {steps} steps" + (f", {scenes} scenes" if scenes else "")
         folder = self.folder / about.replace(", ", "_").replace(" ", "-")
-        start_training(folder, dataclasses.replace(config, train=options), resume=True, progress=False)
+        changed = dataclasses.replace(config, train=options)
+        start_training(folder, changed, resume=True, callback=callback, progress=False)
         metrics = RunFolder(folder).metrics
         record, seconds = metrics.validation(steps), metrics.seconds_per_step()
         if record is None or record["valid_rmse"] is None or seconds is None:
@@ -126,10 +146,10 @@ class Trials:
             ConfigError: the trials would be too short.
         """
         seconds: dict[str, float] = {}
+        first = 60 * minutes * LONGEST / GROWTH ** (ROUNDS - 1)
         for name, config in tried.items():  # a learning rate does not matter
             alike = next((other for other in seconds if tried[other].model == config.model), None)
-            seconds[name] = self.trained(name, config, TIMED).seconds if alike is None else seconds[alike]
-        first = 60 * minutes * LONGEST / GROWTH ** (ROUNDS - 1)
+            seconds[name] = self._step_seconds(name, config, first) if alike is None else seconds[alike]
         steps = {name: int(first / seconds[name]) for name in tried}
         if min(steps.values()) < LEAST:
             least = minutes * LEAST * max(seconds.values()) / first
@@ -138,6 +158,18 @@ class Trials:
                 f" plan for {least:.2g} minutes or more, or train at once"
             )
         return steps
+
+    def _step_seconds(self, name: str, config: RunConfig, first: float) -> float:
+        """The seconds of a step; fewer steps are timed if they show that a trial of `first` seconds is too short."""
+
+        def heed(step: int, figures: Mapping[str, float]) -> None:
+            if step >= FEW and LEAST * figures.get("seconds", 0) > 2 * first:
+                raise _TooSlow(figures["seconds"])
+
+        try:
+            return self.trained(name, config, TIMED, callback=heed).seconds
+        except _TooSlow as few:
+            return few.args[0]
 
     def rounds(self, tried: dict[str, RunConfig], steps: dict[str, int]) -> Iterator[Trial]:
         """The trials of all rounds, each after it was trained; the last one is of the best candidate.

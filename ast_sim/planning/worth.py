@@ -15,10 +15,10 @@ from ast_sim.dataset.reader import Dataset
 from ast_sim.dataset.solver_seconds import read_seconds
 from ast_sim.inference.effort import Effort
 from ast_sim.inference.trained_run import Run
-from ast_sim.planning.trials import MINUTES, TIMED, Trials
+from ast_sim.planning.trials import MINUTES, TIMED, Trials, trial_folder
 from ast_sim.simulate.jobs.generate import checked_workers, generate
 from ast_sim.simulate.own_assembly.spec_reader import read_spec
-from ast_sim.support.argument_checks import file_name, require_type
+from ast_sim.support.argument_checks import require_type
 from ast_sim.support.progress import ShowProgress, duration
 from ast_sim.support.toml_settings import require_range
 from ast_sim.training.configure import configure
@@ -99,7 +99,7 @@ def worth(
     require_type("minutes", minutes, Real, "a number")
     require_range("minutes", minutes, *MINUTES)
     read_spec(spec)  # a mistake in it leaves no folder
-    make_folder(folder := file_name(out, "out"))
+    make_folder(folder := trial_folder(out))
     made = generate(
         "assembly", folder / "scenes.h5", train=SOLVED - 1, valid=1, test=0, nodes=nodes, frames=frames, solver=solver,
         spec=spec, progress=progress,

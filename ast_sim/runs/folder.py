@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 from torch import Tensor
 
 from ast_sim.dataset.reader import Dataset
-from ast_sim.models.registry import build_model
+from ast_sim.models.registry import trained_model
 from ast_sim.models.simulator import Simulator
 from ast_sim.runs import checkpoint
 from ast_sim.runs.config_toml import has_config, read_config, read_origin, read_scope
@@ -104,9 +104,7 @@ class RunFolder:
     def load_model(self) -> Simulator:
         """The trained model of the chosen checkpoint."""
         weights, _, _ = checkpoint.load(self.chosen.path, self.origin["sha256"])
-        model = build_model(self.settings.model)
-        model.load_state_dict(weights)
-        return model.eval()
+        return trained_model(self.settings.model, weights)
 
     def mark_best(self, validation: Mapping[str, Any]) -> None:
         """Mark the checkpoint of a validation, which is a record of `metrics.jsonl`, as the best one."""

@@ -26,7 +26,7 @@ import safetensors.torch
 from safetensors import SafetensorError
 
 import ast_sim
-from ast_sim.models.registry import build_model
+from ast_sim.models.registry import trained_model
 from ast_sim.models.simulator import Simulator
 from ast_sim.runs.folder import Chosen, RunFolder
 from ast_sim.runs.metrics import METRICS, Metrics
@@ -103,12 +103,10 @@ class RunFile(RunFolder):
         """A file has one checkpoint, which is the best one."""
 
     def load_model(self) -> Simulator:
-        model = build_model(self.settings.model)
         try:
-            model.load_state_dict(safetensors.torch.load(self._members[_WEIGHTS]))
+            return trained_model(self.settings.model, safetensors.torch.load(self._members[_WEIGHTS]))
         except (SafetensorError, RuntimeError) as error:
             raise CheckpointError(f"{self.path}: the weights do not fit the settings: {error}") from error
-        return model.eval()
 
     def describe(self) -> dict[str, Any]:
         """What `ast-sim info` says of the file."""

@@ -119,7 +119,7 @@ def assigned(obj: Any, assignments: Iterable[str]) -> dict[str, Any]:
     Values are TOML; the quotes of a string and the brackets of a list may be left out (`model.inputs=stress,material`).
 
     Raises:
-        ConfigError: an assignment has no `=`.
+        ConfigError: an assignment has no `=`, or its list has an empty place.
     """
     values = {}
     kinds = {key: kind for key, _, kind in _leaves(type(obj), obj)}
@@ -128,6 +128,8 @@ def assigned(obj: Any, assignments: Iterable[str]) -> dict[str, Any]:
         if not equals:
             raise ConfigError(f"{assignment!r} is no setting: write key=value")
         values[key] = _parse(text, kinds[key]) if key in kinds else text
+        if isinstance(values[key], list) and "" in values[key]:
+            raise ConfigError(f"{assignment!r} has an empty place in its list: put one comma between two values")
     return values
 
 
@@ -241,7 +243,7 @@ def _parse(text: str, kind: Any) -> Any:
         value = {"true": True, "false": False}.get(text.lower(), text)
     items = [get_args(member)[0] for member in _members(kind) if get_origin(member) is tuple]
     if items and not isinstance(value, list) and text != NONE:
-        return [_parse(part.strip(), items[0]) for part in text.split(",") if part.strip()]
+        return [_parse(part.strip(), items[0]) for part in text.split(",")] if text else []
     return value
 
 

@@ -8,12 +8,16 @@ import os
 import pickle
 import shutil
 import sys
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import torch
+
+from ast_sim.batches.torch_settings import usual_settings
 from ast_sim.dataset.reader import Dataset
 from ast_sim.inference.trained_run import Run
 from ast_sim.models.registry import build_model
@@ -36,6 +40,8 @@ from ast_sim.training.parallel.launch import READY, require_cut, together, usual
 from ast_sim.training.parallel.processes import Processes
 from ast_sim.training.time_budget import UNKNOWN_STEPS, steps_within
 from ast_sim.view.files import make_folder
+
+_training = threading.RLock()  # a callback may train
 
 
 def train(
@@ -118,6 +124,24 @@ def new_model(
     return built
 
 
+@contextmanager
+def _alone() -> Iterator[None]:
+    """Within the block no other thread trains: torch has one sequence of random numbers for all threads. Afterwards
+    this sequence goes on as if nothing had been trained."""
+    if not _training.acquire(blocking=False):
+        raise TrainingError(
+            "another thread of this process trains, and torch has one sequence of random numbers for both: train one"
+            " after the other, or in processes of their own"
+        )
+    try:
+        with torch.random.fork_rng(devices=[]):
+            yield
+    finally:
+        _training.release()
+
+
+@usual_settings()
+@_alone()
 def start_training(
     run: Path,
     config: RunConfig | None = None,
@@ -136,7 +160,7 @@ def start_training(
         from_run, callback, progress: as for `train`; `config` has the model of that run. The leading process calls.
 
     Raises:
-        TrainingError: a loss or a gradient is not finite, the disk is full, or the folder already holds a run.
+        TrainingError: a loss or gradient is not finite, the disk is full, the folder holds a run, or a thread trains.
         ConfigError: settings are out of range, or differ from the settings of the run that is resumed, or the data does
             not fit the model of `from_run`.
         CheckpointError: another process trains in this folder, or no checkpoint in it can be read.

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -13,6 +14,7 @@ from ast_sim.planning import trials as module
 from ast_sim.planning.plan import planned
 from ast_sim.planning.trials import Trial, Trials, candidates, round_sizes
 from ast_sim.runs.config_toml import read_config
+from ast_sim.runs.folder import RunFolder
 from ast_sim.support.errors import ConfigError
 from ast_sim.training.configure import configure
 
@@ -92,7 +94,9 @@ def test_better_candidates_go_on(data, tmp_path, monkeypatch):
     errors = {"tiny": 0.4, "tiny, half the rate": 0.6, "tiny, twice the rate": 0.5, "tiny, wider": 0.3}
     seconds = {name: 0.02 if "wider" in name else 0.01 for name in errors}
     monkeypatch.setattr(
-        Trials, "trained", lambda _, name, config, steps: Trial(name, steps, 4, seconds[name], errors[name], "run")
+        Trials,
+        "trained",
+        lambda _, name, config, steps, callback=None: Trial(name, steps, 4, seconds[name], errors[name], "run"),
     )
     trials, tried = Trials(tmp_path, 4, 1), candidates(run_config(data), "tiny")
     made = list(trials.rounds(tried, trials.first_steps(tried, 2.0)))
@@ -145,6 +149,31 @@ def test_the_trials_have_the_processes_of_the_whole_training(data, monkeypatch):
     monkeypatch.setattr(plan_module, "usual_processes", lambda config: 2 if config.train.minutes == 30 else 1)
     assert plan_module._with_processes(run_config(data), 30).train.processes == 2
     assert plan_module._with_processes(run_config(data, processes=1), 30).train.processes == 1
+
+
+def test_few_steps_are_timed_where_the_minutes_are_too_few(data, tmp_path):
+    config = run_config(data)
+    tried = {name: one for name, one in candidates(config, "tiny").items() if "rate" not in name}
+    trials = Trials(tmp_path / "plan", 6, 3)
+    for call in (1, 2):  # what is there is not timed from the start
+        with pytest.raises(
+            ConfigError, match=r"0.002 minutes are too few to plan: the first trials would have [01] st"
+        ):
+            trials.first_steps(tried, 0.002)
+        for name in ("tiny", "tiny_wider"):
+            steps = [one["step"] for one in RunFolder(tmp_path / "plan" / f"{name}_50-steps").metrics if "loss" in one]
+            assert steps == list(range(5, 6 + 5 * call, 5))
+    assert trials.trained("tiny", config, 50).steps == 50
+
+
+def test_a_run_is_no_folder_for_trials(data, tmp_path):
+    ast_sim.train(data, tmp_path / "run", steps=1, model_settings=SMALL, progress=False, **QUICK)
+    before = sorted((tmp_path / "run").rglob("*"))
+    for call in (ast_sim.plan, ast_sim.worth):
+        source = data if call is ast_sim.plan else Path(__file__).parents[2] / "examples" / "clip" / "SPEC.toml"
+        with pytest.raises(ConfigError, match="run holds a run: choose another folder, in which the trials are made"):
+            call(source, tmp_path / "run", 1.0)
+    assert sorted((tmp_path / "run").rglob("*")) == before
 
 
 @pytest.mark.parametrize("minutes", [0, -1, float("inf"), float("nan")])

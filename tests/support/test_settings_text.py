@@ -156,6 +156,13 @@ def test_facts_of_the_data_are_kept_by_a_change_but_neither_written_read_nor_lis
         ("model.stress=nodes", 'model.stress is \'nodes\'; must be one of "none", "node", "element"'),
         ("model.center=1,2", "model.center is [1, 2]; must be a list (3 values, each a number)"),
         ("model.center=1,2,x", "model.center[2] is 'x'; must be a number"),
+        *(
+            (
+                f"model.center={text}",
+                f"'model.center={text}' has an empty place in its list: put one comma between two values",
+            )
+            for text in (",", ",,", "1,,2", "1,2,", ",1,2", "1, ,2")
+        ),
     ],
 )
 def test_a_wrong_override_names_the_key_and_what_would_fit(assignment, message):

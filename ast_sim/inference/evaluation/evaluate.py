@@ -125,16 +125,15 @@ def one_step_predictions(model: Simulator, truth: Trajectory, name: str) -> tupl
         Positions [S - given, N, 3] and fields [S - given, N or E, *] by name.
     """
     given = model.config.data.given_frames
-    graph = model.graph(truth.scene)
-    position = torch.tensor(truth.position)
-    known = [None] * len(position) if truth.stress is None else torch.tensor(truth.stress)
-    starts = []
-    for frame in range(given, truth.num_frames):
-        state = State(position[frame - 1], position[frame - 2] if given == 2 else None, known[frame - 1])
-        starts.append(Start(f"{name} frame {frame - 1}", graph, state, position[frame]))
     chunk = max(1, ONE_STEP_NODES // truth.scene.num_nodes)
-    predicted = []
+    starts, predicted = [], []
     with model.predicting():
+        graph = model.graph(truth.scene)
+        position = torch.tensor(truth.position)
+        known = [None] * len(position) if truth.stress is None else torch.tensor(truth.stress)
+        for frame in range(given, truth.num_frames):
+            state = State(position[frame - 1], position[frame - 2] if given == 2 else None, known[frame - 1])
+            starts.append(Start(f"{name} frame {frame - 1}", graph, state, position[frame]))
         for first in range(0, len(starts), chunk):
             predicted += predict_frames(model, starts[first : first + chunk])
     fields = {

@@ -109,23 +109,24 @@ def _predicted(
         question.check(model.config.data.given_frames)
     # Several questions may share a scene.
     graph, carrier, solver = cache(model.graph), cache(Carrier), cache(law_of(model.config).newton_steps)
-    scenes = [JumpingScene(model, q, graph(q.scene), carrier(q.scene), solver) for q in questions]
-    frames = [frame for scene in scenes for frame in scene.frames]
-    with model.predicting(), Progress(len(frames), "frames", progress) as bar:
-        for group in (group for wave in _waves(scenes) for group in _groups(model, wave)):
-            _predict(model, group, effort)
-            if not effort.newton_steps and not effort.solved:
-                bar.advance(group[-1].name, len(group))
-        # In ascending order, whatever the domains: with friction a frame needs to know the one before.
-        for frame in frames if effort.newton_steps else ():
-            frame.refine(effort.newton_steps, each_step, bar)
-            if not each_step and effort.newton_steps >= MOST_NEWTON_STEPS and frame.unsettled:
-                _start_again(model, frame, effort, bar)
-            if not effort.solved:
+    with model.predicting():
+        scenes = [JumpingScene(model, q, graph(q.scene), carrier(q.scene), solver) for q in questions]
+        frames = [frame for scene in scenes for frame in scene.frames]
+        with Progress(len(frames), "frames", progress) as bar:
+            for group in (group for wave in _waves(scenes) for group in _groups(model, wave)):
+                _predict(model, group, effort)
+                if not effort.newton_steps and not effort.solved:
+                    bar.advance(group[-1].name, len(group))
+            # In ascending order, whatever the domains: with friction a frame needs to know the one before.
+            for frame in frames if effort.newton_steps else ():
+                frame.refine(effort.newton_steps, each_step, bar)
+                if not each_step and effort.newton_steps >= MOST_NEWTON_STEPS and frame.unsettled:
+                    _start_again(model, frame, effort, bar)
+                if not effort.solved:
+                    bar.advance(frame.name)
+            for frame in frames if effort.solved else ():
+                frame.solve()
                 bar.advance(frame.name)
-        for frame in frames if effort.solved else ():
-            frame.solve()
-            bar.advance(frame.name)
     return scenes
 
 

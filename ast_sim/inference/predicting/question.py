@@ -91,7 +91,7 @@ class Question:
         values = {
             output.name: torch.tensor(self.fields[output.name][:given])
             if output.name in self.fields
-            else torch.zeros(given, rows[output.location], output.columns)
+            else torch.zeros(given, rows[output.location], output.columns, dtype=torch.float32)
             for output in data.outputs
         }
         return [{name: one[frame] for name, one in values.items()} for frame in range(given)]

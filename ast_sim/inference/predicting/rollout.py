@@ -34,19 +34,19 @@ def rollouts(model: Simulator, questions: Sequence[Question], progress: ShowProg
     given = model.config.data.given_frames
     for question in questions:
         question.check(given)
-    scenes = [_RollingScene(model, question, given) for question in questions]
-    count = sum(scene.end - given for scene in scenes)
-    with model.predicting(), Progress(count, "frames", progress) as bar:
-        for frame in range(given, max(scene.end for scene in scenes)):
-            running = [scene for scene in scenes if scene.runs_at(frame)]
-            # Only scenes of the same domain are predicted together: none may change another's domain.
-            for domain in dict.fromkeys(scene.domain for scene in running):
-                group = [scene for scene in running if scene.domain == domain]
-                predicted = predict_frames(model, [scene.start(frame) for scene in group])
-                for scene, of_scene in zip(group, predicted, strict=True):
-                    scene.advance(frame, of_scene)
-            if running:
-                bar.advance(f"frame {frame}", len(running))
+    with model.predicting():
+        scenes = [_RollingScene(model, question, given) for question in questions]
+        with Progress(sum(scene.end - given for scene in scenes), "frames", progress) as bar:
+            for frame in range(given, max(scene.end for scene in scenes)):
+                running = [scene for scene in scenes if scene.runs_at(frame)]
+                # Only scenes of the same domain are predicted together: none may change another's domain.
+                for domain in dict.fromkeys(scene.domain for scene in running):
+                    group = [scene for scene in running if scene.domain == domain]
+                    predicted = predict_frames(model, [scene.start(frame) for scene in group])
+                    for scene, of_scene in zip(group, predicted, strict=True):
+                        scene.advance(frame, of_scene)
+                if running:
+                    bar.advance(f"frame {frame}", len(running))
     return [scene.answer() for scene in scenes]
 
 

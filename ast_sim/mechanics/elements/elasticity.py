@@ -24,6 +24,7 @@ _ENTRY[_ROW, _COLUMN] = _ENTRY[_COLUMN, _ROW] = np.arange(len(_ROW))
 # Entry of the pair with the two nodes exchanged and the components kept: (a i, b j) -> (b i, a j).
 _SWAPPED = _ENTRY[3 * (_COLUMN // 3) + _ROW % 3, 3 * (_ROW // 3) + _COLUMN % 3]
 SWEEPS = 12  # of rotations, at most
+VANISHING = np.errstate(under="ignore")  # products of numbers near zero are zero, whatever a program wants to be told
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,6 +135,7 @@ class Elasticity:
         """Of `hessian`."""
         return (Entries(self._nodes, _ROW, _COLUMN),)
 
+    @VANISHING
     def _lift(self, entries: np.ndarray, deformation: Deformation) -> None:
         """Add to the entries [78,E] of each element what makes the negative eigenvalues of d2 psi / dF2 zero."""
         material, J = self.material, deformation.J
@@ -218,6 +220,7 @@ def negative_directions(
         )
 
 
+@VANISHING
 def eigenvectors(matrices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Eigenvalues [3,E], in no order, and eigenvectors [axis,3,E] of symmetric matrices [3,3,E].
 
