@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -39,8 +40,17 @@ _OPTIONS = {
     **dict.fromkeys(("ENDPART", "ENDASSEMBLY", "ENDINSTANCE"), set()),
 }
 
-# A node or an element: the instance that it belongs to ("" for the scope itself), and its number.
-Members = list[tuple[str, np.ndarray]]
+
+class Members(NamedTuple):
+    """Nodes or elements of a set: the instance that they belong to ("" for the scope itself), and their numbers. A set
+    of nodes may have the nodes of elements."""
+
+    instance: str
+    numbers: np.ndarray
+    of_elements: bool = False
+
+
+Sets = dict[str, list[Members]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,9 +72,8 @@ class Content:
     name: str = ""
     nodes: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)
     blocks: list[ElementBlock] = field(default_factory=list)
-    node_sets: dict[str, Members] = field(default_factory=dict)
-    element_sets: dict[str, Members] = field(default_factory=dict)
-    nodes_of_elements: dict[str, list[str]] = field(default_factory=dict)
+    node_sets: Sets = field(default_factory=dict)
+    element_sets: Sets = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,8 +125,8 @@ class _Reader:
         self.handlers: dict[str, Callable[[Keyword], None]] = {
             "NODE": self._node,
             "ELEMENT": self._element,
-            "NSET": lambda keyword: self._set(keyword, self.content.node_sets, "NSET"),
-            "ELSET": lambda keyword: self._set(keyword, self.content.element_sets, "ELSET"),
+            "NSET": self._set,
+            "ELSET": self._set,
             "SYSTEM": self._system,
             "PART": self._part,
             "INSTANCE": self._instance,
@@ -169,7 +178,7 @@ class _Reader:
             points = points @ self.system[:3] + self.system[3]
         self.content.nodes.append((numbers, points))
         if keyword.options.get("NSET"):
-            self.content.node_sets.setdefault(self._key(keyword.options["NSET"]), []).append(("", numbers))
+            self.content.node_sets.setdefault(self._key(keyword.options["NSET"]), []).append(Members("", numbers))
 
     def _element(self, keyword: Keyword) -> None:
         type_name = keyword.required("TYPE").upper()
@@ -185,51 +194,56 @@ class _Reader:
         numbers, nodes = elements_of(keyword, node_count(kind))
         self.content.blocks.append(ElementBlock(type_name, kind, numbers, nodes, keyword))
         if name:
-            self.content.element_sets.setdefault(self._key(name), []).append(("", numbers))
+            self.content.element_sets.setdefault(self._key(name), []).append(Members("", numbers, True))
 
-    def _set(self, keyword: Keyword, sets: dict[str, Members], option: str) -> None:
-        name = self._key(keyword.required(option))
+    def _set(self, keyword: Keyword) -> None:
+        name = self._key(keyword.required(keyword.name))
         instance = keyword.options.get("INSTANCE", "").upper()
         if instance and instance not in self.deck.instances:
             raise keyword.error(f"there is no instance {keyword.options['INSTANCE']!r}")
-        members = sets.setdefault(name, [])
-        if option == "NSET" and keyword.options.get("ELSET"):
-            elements = keyword.options["ELSET"].upper()
-            if elements not in self.content.element_sets:
-                raise keyword.error(f"there is no set of elements {keyword.options['ELSET']!r}")
-            self.content.nodes_of_elements.setdefault(name, []).append(elements)
+        of_elements = keyword.name == "ELSET"
+        members = self._sets(self.content, of_elements).setdefault(name, [])
+        if not of_elements and keyword.options.get("ELSET"):
+            members.extend(self._named(keyword, True, instance, keyword.options["ELSET"]))
         elif "GENERATE" in keyword.options:
-            members.append((instance, _generated(keyword)))
+            members.append(Members(instance, _generated(keyword), of_elements))
         else:
-            members.extend(self._listed(keyword, sets, instance))
+            members.extend(self._listed(keyword, of_elements, instance))
 
-    def _listed(self, keyword: Keyword, sets: dict[str, Members], instance: str) -> Members:
+    @staticmethod
+    def _sets(content: Content, of_elements: bool) -> Sets:
+        return content.element_sets if of_elements else content.node_sets
+
+    def _listed(self, keyword: Keyword, of_elements: bool, instance: str) -> list[Members]:
         """The members that the data lines list: numbers, names of sets, and both of an instance."""
-        members: Members = []
+        members: list[Members] = []
         numbers: list[int] = []
         for line in keyword.data:
             for text in tokens(line):
                 if text.lstrip("+-").isdigit():
                     numbers.append(whole(text, line))
                 elif text:
-                    members.extend(self._named(keyword, sets, instance, text.strip('"')))
-        return [(instance, np.array(numbers, np.int64)), *members]
+                    members.extend(self._named(keyword, of_elements, instance, text.strip('"')))
+        return [Members(instance, np.array(numbers, np.int64), of_elements), *members]
 
-    def _named(self, keyword: Keyword, sets: dict[str, Members], instance: str, text: str) -> Members:
+    def _named(self, keyword: Keyword, of_elements: bool, instance: str, text: str) -> list[Members]:
+        """The members of a set, or a node or an element of an instance; all with the ones that sets have now."""
         key = text.upper()
+        sets = self._sets(self.content, of_elements)
         if not instance and key in sets:
             return list(sets[key])
         if not instance:
             instance, _, key = key.rpartition(".")
         if instance in self.deck.instances:
             if key.isdigit():
-                return [(instance, np.array([int(key)]))]
+                return [Members(instance, np.array([int(key)]), of_elements)]
             one = self.deck.instances[instance]
-            which = "node_sets" if keyword.name == "NSET" else "element_sets"
-            parts = [getattr(content, which)[key] for content in (one.part, one.own) if key in getattr(content, which)]
+            of_parts = [self._sets(content, of_elements) for content in (one.part, one.own)]
+            parts = [sets[key] for sets in of_parts if key in sets]
             if parts:
-                return [(instance, numbers) for members in parts for _, numbers in members]
-        raise keyword.error(f"there is no set {text!r} before this line")
+                return [some._replace(instance=instance) for members in parts for some in members]
+        kind = "elements" if of_elements else "nodes"
+        raise keyword.error(f"there is no set of {kind} {text!r} before this line")
 
     def _system(self, keyword: Keyword) -> None:
         """An origin, a point on the x axis and one in the plane of x and y. The origin alone: the axes stay; without

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ast_sim.importers.decks.deck_content import Content, Deck, ElementBlock, Members, read_deck
+from ast_sim.importers.decks.element_types import REVOLVED
 from ast_sim.importers.formats.source_mesh import CellBlock, SourceMesh
 from ast_sim.support.errors import DatasetError
 
@@ -58,6 +59,11 @@ class _Assembly:
             self._add(name, (one.part, one.own), one.rotation, one.shift)
         if not deck.instances and deck.parts:
             self._parts_without_instances()
+        placed = {one.part.name for one in deck.instances.values()}
+        for name, part in deck.parts.items() if placed else ():
+            if name not in placed and part.blocks:
+                count = sum(len(block.numbers) for block in part.blocks)
+                self.notes.append(f"the part {deck.written[name]} has no instance: its {count} elements are left out")
         self.blocks: list[CellBlock] = []
         self.elements: dict[str, tuple[np.ndarray, list[np.ndarray]]] = {}
 
@@ -89,6 +95,10 @@ class _Assembly:
             raise DatasetError(f"{self.deck.path}: holds {held}: a scene needs elements of a volume")
         notes = [*self.notes]
         notes += [f"{count} elements of the type {name} are left out" for name, count in self.deck.left_out.items()]
+        turned = sum(len(block.nodes) for block in self.blocks if block.label.startswith(REVOLVED))
+        notes += (
+            [f"{turned} elements are sections of a body of revolution: they are taken as a plane"] if turned else []
+        )
         ignored = self.deck.ignored.keys() - set(understood)
         if ignored:
             notes.append(f"ignored keywords: {', '.join(sorted(ignored))}")
@@ -155,19 +165,17 @@ class _Assembly:
 
     def _sets_of(self, name: str, content: Content) -> dict[str, np.ndarray]:
         """The nodes of each set. Of a set of nodes and one of elements with the same name, the set of nodes counts."""
-        sets = {key: self._nodes_of(name, members, True) for key, members in content.element_sets.items()}
-        own = {key: self._nodes_of(name, members, False) for key, members in content.node_sets.items()}
-        for key, others in content.nodes_of_elements.items():
-            own[key] = np.unique(np.concatenate([own[key], *(sets[other] for other in others)]))
+        sets = {key: self._nodes_of(name, members) for key, members in content.element_sets.items()}
+        own = {key: self._nodes_of(name, members) for key, members in content.node_sets.items()}
         for key in sets.keys() & own.keys():
             if not np.array_equal(sets[key], own[key]):
                 self.notes.append(f"the set {self.deck.written[key]!r} of nodes is taken, not the one of elements")
         return {**sets, **own}
 
-    def _nodes_of(self, name: str, members: Members, of_elements: bool) -> np.ndarray:
+    def _nodes_of(self, name: str, members: list[Members]) -> np.ndarray:
         """The places of the members of a set that there are; a deck may list others, as Abaqus and CalculiX allow."""
         groups = [np.zeros(0, np.int64)]
-        for instance, numbers in members:
+        for instance, numbers, of_elements in members:
             scope = self.scopes[instance or name]
             known, nodes = self.elements[instance or name] if of_elements else (scope.numbers, [])
             row = np.searchsorted(known, numbers)

@@ -12,6 +12,9 @@ _SURFACES = (
     *("AC2D", "ACAX"),
 )
 
+# Elements that stand for the ring that they make around the y axis.
+REVOLVED = ("CAX", "CGAX", "DCAX", "DCCAX", "ACAX")
+
 _KIND_OF_VOLUME = {
     4: "tetra",
     5: "pyramid",

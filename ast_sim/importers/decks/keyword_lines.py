@@ -117,14 +117,14 @@ def _lines(path: Path, within: tuple[Path, ...]) -> Iterator[Line]:
     lines = _own_lines(path)
     for line in lines:
         text = line.text
-        if not re.match(r"\*\s*include\s*,", text, re.IGNORECASE):
+        if not re.match(r"\*\s*include", text, re.IGNORECASE):
             yield line
             continue
         if text.endswith(","):  # its options go on in the next line
             text += next(lines, line).text
         options = _options(line, text.partition(",")[2])
         if not options.get("INPUT"):
-            raise DatasetError(f"{line.place}: *INCLUDE has no INPUT=")
+            raise DatasetError(f"{line.place}: {text!r} names no file: write *INCLUDE, INPUT=FILE")
         first = (*within, path)[0]
         yield from _lines(_included(line, options["INPUT"], first), (*within, path))
 

@@ -53,7 +53,7 @@ def material_columns(deck: Deck) -> tuple[dict[str, list[np.ndarray]], list[str]
                 raise keyword.error(f"there is no material {keyword.options['MATERIAL']!r}")
             if elements not in deck.root.element_sets:
                 raise keyword.error(f"there is no set of elements {keyword.options['ELSET']!r}")
-            numbers = np.concatenate([numbers for _, numbers in deck.root.element_sets[elements]])
+            numbers = np.concatenate([members.numbers for members in deck.root.element_sets[elements]])
             one = materials[name]
             for block, table in zip(blocks, tables, strict=True):
                 here = np.isin(block.numbers, numbers)
