@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import io
 import re
 import tempfile
 import xml.etree.ElementTree as ET
@@ -12,7 +11,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 
 from ast_sim.importers.decks.deck_mesh import deck_mesh
@@ -21,6 +19,7 @@ from ast_sim.importers.formats.gmsh_files import gmsh_frames
 from ast_sim.importers.formats.source_mesh import CellBlock, SourceMesh, from_meshio
 from ast_sim.importers.formats.stl_file import BadSurface, read_stl
 from ast_sim.importers.formats.vtk_files import BLOCKS, ENDINGS, is_dyna, vtk_frames
+from ast_sim.importers.meshio_files import by_meshio, what_meshio_says
 from ast_sim.support.errors import DatasetError
 
 # Formats whose files hold all frames of a simulation.
@@ -29,8 +28,6 @@ WITH_FRAMES = (".vtkhdf", ".frd", ".e", ".ex2", ".exo", ".exoii", ".exii")
 # Formats in which each frame is a file of its own; files of the last ones may hold all frames.
 XDMF = (".xdmf", ".xmf")
 ONE_FRAME = (".vtu", ".pvtu", ".vtk", ".vtp", ".pvtp", ".vts", ".pvts", *BLOCKS, *XDMF, ".msh")
-
-_INSTEAD = "write it as .vtu, .vtk, .msh or .inp"
 
 
 def holds_frames(path: Path) -> bool:
@@ -78,7 +75,7 @@ def frames_in(path: Path) -> Iterator[SourceMesh]:
     elif ending in XDMF:
         yield from _xdmf_frames(path)
     else:
-        yield _by_meshio(path)
+        yield by_meshio(path)
 
 
 def _beginning(path: Path) -> bytes:
@@ -94,49 +91,6 @@ def _surface(path: Path) -> SourceMesh:
         raise DatasetError(f"{path}: cannot be read as a mesh: {error}") from error
     points, nodes = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
     return SourceMesh(path, points, [CellBlock("triangle", nodes.reshape(-1, 3), "triangle")])
-
-
-def _by_meshio(path: Path, copy: Path | None = None) -> SourceMesh:
-    """Read a file, or its copy, by meshio. On a damaged file meshio may raise any error, print, or raise SystemExit."""
-    import meshio
-
-    if path.suffix.lower() == ".med":
-        _require_cartesian(path)
-    printed = io.StringIO()
-    try:
-        with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
-            mesh = meshio.read(copy or path)
-    except (Exception, SystemExit) as error:
-        told = _told(error, printed.getvalue()).replace(str(copy), str(path))
-        if "Could not deduce file format" in told:
-            told = f"files of the kind {path.suffix} are not read; {_INSTEAD}"
-        else:
-            told += f"; if it is whole, {_INSTEAD}"
-        raise DatasetError(f"{path}: cannot be read as a mesh: {told}") from error
-    return from_meshio(mesh, path)
-
-
-def _require_cartesian(path: Path) -> None:
-    """Raise DatasetError if the coordinates of a MED file are cylindrical or spherical: meshio reads over it."""
-    with contextlib.suppress(OSError, KeyError, AttributeError), h5py.File(path, "r") as file:
-        meshes: Any = file["ENS_MAA"]
-        for name, mesh in meshes.items():
-            if mesh.attrs.get("REP", 0) != 0:
-                raise DatasetError(f"{path}: the coordinates of {name} are not along x, y and z: write Cartesian ones")
-
-
-def _told(error: BaseException, printed: str = "") -> str:
-    """What meshio says on a file that it cannot read, in one line."""
-    from meshio import ReadError
-
-    if isinstance(error, SystemExit | OSError | ReadError):
-        told = " ".join(f"{printed} {error if str(error) != '1' else ''}".split())
-        return told or "meshio cannot read it"
-    key = error.args[0] if isinstance(error, KeyError) and error.args else None
-    lacking = re.search(r"object '([^']*)' doesn't exist", str(key))
-    if lacking:
-        return f"meshio looks for {lacking[1]!r} in it, which it does not hold"
-    return f"meshio does not know {key}" if key is not None else f"meshio stopped: {' '.join(str(error).split())}"
 
 
 def _xdmf_frames(path: Path) -> Iterator[SourceMesh]:
@@ -161,7 +115,7 @@ def _xdmf_frames(path: Path) -> Iterator[SourceMesh]:
     time, timed = (None, False) if series else _without_time(path, tree)
     with _beside(path, tree, _with_grid_types(tree) or timed) as copy:
         if not series:
-            mesh = _by_meshio(path, copy)
+            mesh = by_meshio(path, copy)
             yield replace(mesh, time=time, notes=[*mesh.notes, *sets])
             return
         _require_plain(path, series)
@@ -180,7 +134,7 @@ def _xdmf_frames(path: Path) -> Iterator[SourceMesh]:
         except DatasetError:
             raise
         except (Exception, SystemExit) as error:
-            raise DatasetError(f"{path}: cannot be read as a mesh: {_told(error)}") from error
+            raise DatasetError(f"{path}: cannot be read as a mesh: {what_meshio_says(error)}") from error
 
 
 def _without_time(path: Path, tree: ET.ElementTree[Any]) -> tuple[float | None, bool]:

@@ -174,7 +174,9 @@ class Reader:
             version, binary, _ = lines[start + 1].split()
             self.version = float(version)
         except (AssertionError, ValueError, IndexError):
-            raise DatasetError(f"{path}: cannot be read as a mesh: is no .msh file of Gmsh, or damaged") from None
+            raise DatasetError(
+                f"{path}: cannot be read as a mesh: is no .msh file of Gmsh's format 4.1 or 2.2, or damaged"
+            ) from None
         if self.version not in _VERSIONS:
             raise DatasetError(
                 f"{path}: cannot be read as a mesh: is of Gmsh's format {version.decode()}; write it as 4.1 or 2.2"

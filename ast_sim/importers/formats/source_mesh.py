@@ -108,6 +108,11 @@ class SourceMesh:
         """
         used = np.zeros(len(self.points), bool)
         for block in self.blocks:
+            if block.dimension and block.nodes.shape[1:] != (node_count(block.kind),):
+                raise DatasetError(
+                    f"{self.path}: cells of the kind {block.label} have {block.nodes.shape[1]} nodes; must have"
+                    f" {node_count(block.kind)}: are lines of the file missing or cut short?"
+                )
             require_nodes(str(self.path), block.label, block.nodes, len(self.points))
             used[block.nodes] = True
         bad = used & ~np.isfinite(self.points).all(axis=1)
@@ -138,9 +143,10 @@ def from_meshio(mesh: meshio.Mesh, path: Path) -> SourceMesh:
     Raises:
         DatasetError: it holds cells of an unknown kind.
     """
-    points = np.zeros((len(mesh.points), 3))
     given = np.asarray(mesh.points, np.float64)
-    points[:, : given.shape[1] if given.ndim == 2 else 0] = given
+    if given.ndim != 2 or given.shape[1] > 3:
+        raise DatasetError(f"{path}: its points have the shape {given.shape}; must be rows of up to three coordinates")
+    points = np.pad(given, ((0, 0), (0, 3 - given.shape[1])))
     kept = [index for index, block in enumerate(mesh.cells) if len(block)]
     cells = [mesh.cells[index] for index in kept]
     unknown = [block.type for block in cells if block.type.rstrip(string.digits) not in SHAPES]

@@ -1,0 +1,164 @@
+"""Kinds of files that meshio reads in part, or looks at without end: read whole, or refused."""
+
+import meshio
+import numpy as np
+import pytest
+from blocks import block
+
+from ast_sim.importers.mesh_file import read_mesh
+from ast_sim.simulate.shapes.mesh import second_order
+from ast_sim.support.errors import DatasetError
+
+CUBE = block(1, 1, 1)
+POINTS = CUBE.rest_position.astype(float)
+HEXAHEDRON = ((0, 4, 6, 2, 1, 5, 7, 3),)
+BEGIN = "SOL 101\nCEND\nBEGIN BULK\n"
+
+
+def volume(mesh):
+    corners = mesh.points[mesh.elements[:, :4]]
+    return np.linalg.det(corners[:, 1:] - corners[:, :1]).sum() / 6
+
+
+@pytest.mark.parametrize(
+    "name", ["a.mesh", "a.meshb", "a.med", "a.vol", "a.node", "a.bdf", "a.avs", "a.f3grid", "a.b8.ugrid", "a.xdmf"]
+)
+def test_kinds_that_are_read_keep_points_and_elements(tmp_path, name):
+    meshio.Mesh(POINTS, [("tetra", CUBE.elements)]).write(tmp_path / name)
+    mesh = read_mesh(tmp_path / name)
+    assert len(mesh.points) == 8 and len(mesh.elements) == 6
+    assert volume(mesh) == pytest.approx(1)
+
+
+@pytest.mark.parametrize("name", ["a.med", "a.vol", "a.bdf", "a.xdmf"])
+def test_second_order_elements_are_kept(tmp_path, name):
+    points, elements = second_order(POINTS, CUBE.elements)
+    meshio.Mesh(points, [("tetra10", elements)]).write(tmp_path / name)
+    mesh = read_mesh(tmp_path / name)
+    assert mesh.elements.shape == (6, 10)
+    np.testing.assert_allclose(np.sort(mesh.points[mesh.elements].mean(1), 0), np.sort(points[elements].mean(1), 0))
+
+
+@pytest.mark.parametrize(
+    "name", ["a.cgns", "a.tec", "a.dat", "a.su2", "a.post", "a.dato", "a.mdpa", "a.hmf", "a.h5m", "a.svg", "a.wkt"]
+)
+def test_kinds_that_meshio_reads_in_part_are_refused(tmp_path, name):
+    (tmp_path / name).write_text("VARIABLES = X Y Z\n")
+    with pytest.raises(DatasetError, match=f"{name}: .* files of the kind .* are not read; write it as .vtu, .vtk"):
+        read_mesh(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("content", "cause"),
+    [
+        ("", "is no .msh file of Gmsh's format 4.1 or 2.2, or damaged"),
+        ("$NOD\n1\n1 0 0 0\n$ENDNOD\n", "is no .msh file of Gmsh's format 4.1 or 2.2, or damaged"),
+        ('(0 "Fluent")\n(2 3)\n(10 (0 1 3 0))\n(13 (0 1 1 0))\n', "lists the faces of its cells, as Fluent does"),
+        ("(2 3)\n(10 (0 1 3 0))\n( 3013 ( 3 1 1 2 3)(", "lists the faces of its cells, as Fluent does"),
+    ],
+)
+def test_files_of_fluent_and_of_gmsh_1_are_refused(tmp_path, content, cause):
+    """A file of Fluent lists the faces of its cells: they are no elements."""
+    (tmp_path / "a.msh").write_text(content)
+    with pytest.raises(DatasetError, match=f"a.msh: .*{cause}"):
+        read_mesh(tmp_path / "a.msh")
+
+
+def grid(number, point, system=""):
+    return f"{'GRID':8}{number:8}{system:>8}" + "".join(f"{float(x):8.3f}" for x in point) + "\n"
+
+
+def card(name, nodes, end):
+    """A card of an element, in fields of eight characters; `end` is what stands at the end of lines that go on."""
+    fields = [f"{text:>8}" for text in (1, 1, *nodes)]
+    lines = ["".join(fields[at : at + 8]) for at in range(0, len(fields), 8)]
+    return f"{name:8}" + f"{end}\n        ".join(lines) + "\n"
+
+
+GRIDS = "".join(grid(1 + row, point) for row, point in enumerate(POINTS))
+WHOLE = GRIDS + "".join(card("CTETRA", 1 + cell, "") for cell in CUBE.elements)
+
+
+def nastran(folder, text):
+    (folder / "a.bdf").write_text(f"{BEGIN}{text}ENDDATA\n")
+    return read_mesh(folder / "a.bdf")
+
+
+@pytest.mark.parametrize(
+    ("text", "cause"),
+    [
+        (GRIDS.replace(grid(8, POINTS[7]), grid(8, POINTS[7], "5")), "GRID with a coordinate system of its own"),
+        ("GRID,1,5,0.,0.,0.\n", "GRID with a coordinate system of its own"),
+        (f"{'GRID*':8}{1:16}{5:16}{0.0:16}{0.0:16}\n{'*':8}{0.0:16}\n", "GRID with a coordinate system of its own"),
+        (f"GRDSET  {'':8}{5:8}\n{WHOLE}", "GRDSET with a coordinate system of its own"),
+        (f"INCLUDE 'more.bdf'\n{WHOLE}", "an INCLUDE"),
+        (f"{WHOLE}CHEX20  {7:8}{1:8}\n", "CHEX20 elements"),
+        (f"{WHOLE}CQUADX,7,1,1,2,3,4\n", "CQUADX elements"),
+    ],
+)
+def test_cards_of_nastran_that_meshio_reads_over_are_refused(tmp_path, text, cause):
+    with pytest.raises(DatasetError, match=f"a.bdf: holds an? ?{cause}|a.bdf: holds {cause}"):
+        nastran(tmp_path, text)
+
+
+@pytest.mark.parametrize("more", ["CONM2,9,1\n", "CORD2C,5,0\n", "CBAR,9,1,1,2\n", "MAT1,1,2.1e5,,0.3\n", "$ CQUADX\n"])
+def test_cards_of_nastran_that_say_nothing_of_elements_are_passed_over(tmp_path, more):
+    mesh = nastran(tmp_path, WHOLE + more)
+    assert len(mesh.elements) == 6 and volume(mesh) == pytest.approx(1)
+    in_space = "".join(grid(1 + row, point, "0") for row, point in enumerate(POINTS))
+    assert volume(nastran(tmp_path, WHOLE.replace(GRIDS, in_space))) == pytest.approx(1)
+
+
+@pytest.mark.parametrize("end", [" " * 8, "+       ", ""])
+def test_a_card_of_nastran_whose_next_line_is_lost_is_refused(tmp_path, end):
+    """An editor that strips lines makes meshio leave out the second line of an element."""
+    text = GRIDS + card("CHEXA", [1 + node for node in HEXAHEDRON[0]], end)
+    if end.startswith("+"):
+        text = text.replace("\n        ", "\n+       ")
+    if end:
+        assert volume(nastran(tmp_path, text)) == pytest.approx(1)
+    else:
+        with pytest.raises(DatasetError, match="cells of the kind hexahedron have 6 nodes; must have 8: are lines"):
+            nastran(tmp_path, text)
+
+
+@pytest.mark.parametrize(("name", "content"), [("a.off", "OFF\n"), ("a.off", ""), ("a.ply", "ply\nformat ascii 1.0\n")])
+def test_a_surface_that_is_cut_off_is_refused_at_once(tmp_path, name, content):
+    (tmp_path / name).write_text(content)
+    with pytest.raises(DatasetError, match=f"{name}: cannot be read as a mesh: "):
+        read_mesh(tmp_path / name)
+
+
+@pytest.mark.parametrize("ending", [".node", ".ele"])
+@pytest.mark.parametrize("content", ["", "# only a comment\n"])
+def test_a_file_of_tetgen_that_is_cut_off_is_refused_at_once(tmp_path, ending, content):
+    meshio.Mesh(POINTS, [("tetra", CUBE.elements)]).write(tmp_path / "a.node")
+    (tmp_path / "a").with_suffix(ending).write_text(content)
+    with pytest.raises(DatasetError, match=f"a{ending}: cannot be read as a mesh: it is empty"):
+        read_mesh(tmp_path / "a.node")
+    (tmp_path / "a.ele").unlink()
+    with pytest.raises(DatasetError, match="a.node: cannot be read as a mesh"):
+        read_mesh(tmp_path / "a.node")
+
+
+@pytest.mark.parametrize("columns", ["x y z", "x y z nx", "y x z", "nx x y z", "x y"])
+def test_points_of_a_ply_file_are_x_y_and_z(tmp_path, columns):
+    names = columns.split()
+    rows = [" ".join(str(dict(zip("xyz", point, strict=True)).get(name, 0.5)) for name in names) for point in POINTS]
+    properties = "".join(f"property float {name}\n" for name in names)
+    head = (
+        f"ply\nformat ascii 1.0\nelement vertex 8\n{properties}element face 2\nproperty list uchar int vertex_indices\n"
+    )
+    (tmp_path / "a.ply").write_text(head + "end_header\n" + "\n".join([*rows, "3 0 1 2", "3 1 3 2"]) + "\n")
+    if names[:3] == ["x", "y", "z"]:
+        assert np.array_equal(read_mesh(tmp_path / "a.ply").points, POINTS)
+    else:
+        with pytest.raises(DatasetError, match="its points do not begin with x, y and z"):
+            read_mesh(tmp_path / "a.ply")
+
+
+def test_points_of_a_mesh_in_memory_are_rows():
+    mesh = meshio.Mesh(POINTS, [("tetra", CUBE.elements)])
+    mesh.points = POINTS.ravel()
+    with pytest.raises(DatasetError, match=r"its points have the shape \(24,\); must be rows of up to three"):
+        read_mesh(mesh)
