@@ -135,12 +135,16 @@ class MeshFile:
 
     def marks(self, name: str) -> np.ndarray:
         """[n] bool: the points at which a point field is not zero. NaN is no mark: programs fill a field with it where
-        a block lacks the field. A note says at how many points."""
+        a block lacks the field. Notes say at how many points it is NaN, and negative, which may mean no mark."""
         values = self.numbers("point", name)
-        unset = int(np.isnan(values[np.unique(self.elements)]).sum())
-        note = f"the field {name!r} is NaN at {unset} nodes: they are not marked"
-        if unset and note not in self.notes:
-            self.notes.append(note)
+        used = values[np.unique(self.elements)]
+        for rows, note in (
+            (np.isnan(used), "is NaN at {} nodes: they are not marked"),
+            (used < 0, "is negative at {} nodes: they are marked, as all where it is not 0"),
+        ):
+            told = f"the field {name!r} {note.format(rows.sum())}"
+            if rows.any() and told not in self.notes:
+                self.notes.append(told)
         return self._kept(marked(values))
 
     def whole_numbers(self, place: str, name: str, dtype: type) -> np.ndarray:

@@ -28,7 +28,7 @@ from ast_sim.importers.solids.positions import far_origin, rest_and_position, wa
 from ast_sim.importers.solids.stitching import Stitching
 from ast_sim.importers.solved_jobs.job import Job, read_job
 from ast_sim.importers.solved_jobs.job_results import job_frames
-from ast_sim.importers.stress import STRESS_UNITS, order_of, von_mises
+from ast_sim.importers.stress import STRESS_UNITS, are_components, order_of, von_mises
 from ast_sim.plausibility.axes import MIRRORED
 from ast_sim.scene import NodeType, Scene, Trajectory
 from ast_sim.support.argument_checks import several
@@ -54,7 +54,7 @@ class FieldNames:
         material: cell fields with one number each; they become the columns of `Scene.material`. "young=E" takes the
             field E and calls the column young; `ast_sim.Material` says which names have a meaning.
         stress_order: the components that the columns of the stress hold, such as ("xx", "xy", "xz", "yy", "yz", "zz").
-            Empty: as the file names them; else the normal stresses come first.
+            Empty: as the file names them; else the normal stresses come first. Six columns in XDMF need it.
         stress_unit: the unit of the stress, and of Young's modulus in a deck: one of `STRESS_UNITS`; None is pascal.
         fields: further point or cell fields, as NAME or NAME=UNIT, that become named fields of the dataset.
         reaction: point field, the forces that act on the nodes from outside.
@@ -200,7 +200,7 @@ def _read_frames(
         if place != "none":
             name = names.stress or "von_mises"
             values = raw_field(frame, "point" if place == "node" else "cell", name)
-            now = order_of(frame.path, name, values.shape[1], frame.columns.get(name, ()), names.stress_order)
+            now = order_of(frame.path, name, values, frame.columns.get(name, ()), names.stress_order)
             if now != order:
                 one, other = (", ".join(parts) or "one number" for parts in (now, order))
                 raise DatasetError(f"{frame.path}: {name!r} holds {one}, in the first frame {other}: write it alike")
@@ -266,13 +266,18 @@ def _stress_place(frame: SourceMesh, names: FieldNames) -> tuple[str, tuple[str,
     place = "node" if name in frame.point_fields else "element" if name in frame.cell_fields else "none"
     if place == "none":
         if names.stress is not None:
-            known = ", ".join(sorted({*frame.point_fields, *frame.cell_fields})) or "none"
-            raise DatasetError(f"{frame.path}: there is no field {names.stress!r}; there are: {known}")
+            known = sorted({*frame.point_fields, *frame.cell_fields})
+            parts = "; components that are fields of their own cannot be taken: write them as one field, or the von"
+            parts = f"{parts} Mises stress" if are_components(known) else ""
+            listed = ", ".join(known) or "none"
+            raise DatasetError(f"{frame.path}: there is no field {names.stress!r}; there are: {listed}{parts}")
         return place, (), []
-    columns = raw_field(frame, "point" if place == "node" else "cell", name).shape[1]
-    order = order_of(frame.path, name, columns, frame.columns.get(name, ()), names.stress_order)
-    note = f"the von Mises stress is computed from the components {', '.join(order)} of {name!r}"
-    return place, order, [note] if order else []
+    values = raw_field(frame, "point" if place == "node" else "cell", name)
+    order = order_of(frame.path, name, values, frame.columns.get(name, ()), names.stress_order)
+    both = name in frame.point_fields and name in frame.cell_fields
+    notes = [f"{name!r} is a field of points and one of cells: the one of points is taken"] if both else []
+    computed = f"the von Mises stress is computed from the components {', '.join(order)} of {name!r}"
+    return place, order, [*notes, computed] if order else notes
 
 
 def _stress(

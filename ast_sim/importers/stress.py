@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 
+from ast_sim.importers.frames_in_file import XDMF
 from ast_sim.support.errors import ConfigError, DatasetError
 
 # Where the six components stand if nobody says so: the three normal stresses, then the shear stresses. CalculiX, VTK,
@@ -18,6 +20,9 @@ _ORDERS = {
     6: _NORMAL_FIRST,
     9: ("xx", "xy", "xz", "yx", "yy", "yz", "zx", "zy", "zz"),
 }
+# A tensor of plane stress, as arrays of two rows and two columns have it.
+_IN_THE_PLANE = ("xx", "xy", "yx", "yy")
+
 # Units of stress in pascal.
 STRESS_UNITS = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "GPa": 1e9, "psi": 6894.757293168}
 
@@ -31,21 +36,30 @@ def parse_order(text: str) -> tuple[str, ...]:
         ConfigError: a component is unknown, missing or named twice.
     """
     order = tuple(part.strip().lower() for part in text.split(","))
-    if len(order) not in _ORDERS or set(map(_sorted, order)) != set(map(_sorted, _ORDERS[len(order)])):
+    if not _is_order(order):
         raise ConfigError(f"{text!r} is no order of the components of a stress; an example is xx,yy,zz,xy,yz,xz")
     return order
 
 
-def order_of(path: Path, name: str, columns: int, names: tuple[str, ...], given: tuple[str, ...]) -> tuple[str, ...]:
-    """The components that the columns of a stress field hold; () if it holds the von Mises stress itself.
+def _is_order(order: tuple[str, ...]) -> bool:
+    known = (*_ORDERS.values(), _IN_THE_PLANE)
+    return sorted(map(_sorted, order)) in [sorted(map(_sorted, one)) for one in known]
+
+
+def order_of(
+    path: Path, name: str, values: np.ndarray, names: tuple[str, ...], given: tuple[str, ...]
+) -> tuple[str, ...]:
+    """The components that the columns of a stress field [rows, columns] hold; () if it holds the von Mises stress
+    itself.
 
     Args:
         names: the names of the columns in the file, if it has any.
         given: the order that the user has named, or ().
 
     Raises:
-        DatasetError: the field cannot be a stress.
+        DatasetError: the field cannot be a stress, or its order is not certain.
     """
+    columns = values.shape[1]
     if columns == 1:
         return ()
     if columns not in _ORDERS:
@@ -56,11 +70,36 @@ def order_of(path: Path, name: str, columns: int, names: tuple[str, ...], given:
     if given:
         if len(given) != columns:
             raise DatasetError(f"{path}: the field {name!r} has {columns} components, but the order names {len(given)}")
+        if not _is_order(given):
+            raise DatasetError(f"{path}: {', '.join(given)} is no order of the components of {name!r}")
         return given
     read = tuple(_component(text) for text in names)
-    if len(read) == columns and set(map(_sorted, read)) == set(map(_sorted, _ORDERS[columns])):
+    if len(read) == columns and _is_order(read):
         return read
+    doubt = _doubt_of_order(path, values)
+    if doubt:
+        raise DatasetError(f"{path}: the order of the {columns} components of {name!r} is not certain: {doubt}")
     return _ORDERS[columns]
+
+
+def _doubt_of_order(path: Path, values: np.ndarray) -> str:
+    """Why the usual order may be wrong, and what to do; empty if nothing says so."""
+    if path.suffix.lower() in XDMF and values.shape[1] == 6:
+        return (
+            "XDMF's own is xx, xy, xz, yy, yz, zz, but not all programs keep to it; say it, stress_order=('xx', 'yy',"
+            " 'zz', 'xy', 'yz', 'xz') (--stress-order xx,yy,zz,xy,yz,xz)"
+        )
+    if values.shape[1] == 4 and values[:, 1].any() and np.array_equal(values[:, 1], values[:, 2]):
+        return (
+            "the second and the third are equal in all rows, as xy and yx are; say it, stress_order=('xx', 'xy', 'yx',"
+            " 'yy') (--stress-order xx,xy,yx,yy), or xx,yy,zz,xy"
+        )
+    return ""
+
+
+def are_components(names: Iterable[str]) -> bool:
+    """Whether fields of these names seem to be the components of a stress."""
+    return len({_sorted(_component(name)) for name in names} & set(_NORMAL_FIRST)) >= len(_ORDERS[4])
 
 
 def von_mises(values: np.ndarray, order: tuple[str, ...]) -> np.ndarray:

@@ -1,6 +1,6 @@
 """What looks wrong in the frames of a simulation: tools that change their shape, displacements in other units, elements
 that turn over, frames that repeat, bodies that change their places, displacements from the frame before, no motion,
-Poisson's ratios and yield stresses that cannot be one, contact that no model can see.
+Poisson's ratios, yield stresses and stresses that cannot be one, contact that no model can see.
 
 Legend: S frames, N nodes, E elements.
 """
@@ -35,6 +35,9 @@ _STILL = 1e-6
 _MOST_WORLD_EDGES = 60
 _DEEPEST = 14
 
+# A von Mises stress that is carried from elements to nodes may be negative by this share of the largest.
+_OVERSHOOT = 0.05
+
 # Frames in which world edges are counted.
 _FRAMES = 5
 
@@ -51,6 +54,7 @@ def in_trajectory(trajectory: Trajectory) -> list[Finding]:
         *_soft_tools(scene, position),
     ]
     findings += [*_turn_over(scene, position), *_repeats(position, trajectory.stress)]
+    findings += _negative_stress(trajectory)
     findings += [*change_places(scene, position), *counted_from_frame_before(scene, position)]
     return [*findings, *_contact(scene, position)]
 
@@ -66,6 +70,20 @@ def _poisson(trajectory: Trajectory) -> list[Finding]:
         return []
     meaning = f"it is {ratio[rows[0]]:g} and must lie between -1 and 0.5: is it the field of another quantity?"
     return [Finding("elements whose Poisson's ratio cannot be one", len(rows), places("elements", rows), meaning)]
+
+
+def _negative_stress(trajectory: Trajectory) -> list[Finding]:
+    """Stresses below zero by more than a smooth field is that was carried from elements to nodes."""
+    if trajectory.stress is None:
+        return []
+    stress = trajectory.stress[:, trajectory.scene.deforming(trajectory.stress_at), 0]
+    frames, rows = np.nonzero(stress < -_OVERSHOOT * np.abs(stress).max(initial=0))
+    if not len(rows):
+        return []
+    worst = int(np.argmin(stress[frames, rows]))
+    where = f"the lowest is {stress[frames, rows][worst]:.3g} in frame {frames[worst]}"
+    meaning = "no von Mises stress is negative: is it a component, a principal stress or a pressure?"
+    return [Finding("stresses below zero", len(rows), where, meaning)]
 
 
 def _still(scene: Scene, position: np.ndarray) -> list[Finding]:

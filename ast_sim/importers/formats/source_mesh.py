@@ -29,6 +29,8 @@ SHAPES = {
     "hexahedron": (3, 8),
 }
 
+BEZIER = "Bezier "  # what the labels of such cells begin with
+
 
 def node_count(kind: str) -> int:
     """The number of nodes of a cell of a kind."""
@@ -61,6 +63,12 @@ class CellBlock:
     def is_curved(self) -> bool:
         """Whether the cells have nodes beside their corners."""
         return self.nodes.shape[1] > SHAPES[self.shape][1]
+
+    @property
+    def has_middles(self) -> bool:
+        """Whether the cells are tetrahedra with nodes in the middles of their edges. The further points of a Bezier
+        cell lie beside its edges."""
+        return self.kind == "tetra10" and not self.label.startswith(BEZIER)
 
     def rows(self, kept: np.ndarray) -> CellBlock:
         return CellBlock(self.kind, self.nodes[kept], self.label)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ast_sim.importers.formats.source_mesh import SHAPES, CellBlock, node_count
+from ast_sim.importers.formats.source_mesh import BEZIER, SHAPES, CellBlock, node_count
 from ast_sim.support.errors import DatasetError
 
 # Types of VTK with a fixed number of nodes.
@@ -41,7 +41,8 @@ _KINDS = {
 
 # Lagrange and Bezier cells: their number of nodes says the order; the corners stand first.
 _ANY_ORDER = {68: "line", 69: "triangle", 70: "quad", 71: "tetra", 72: "hexahedron", 73: "wedge", 74: "pyramid"}
-_ANY_ORDER |= {number + 7: shape for number, shape in _ANY_ORDER.items()}
+_BEZIER = {number + 7: shape for number, shape in _ANY_ORDER.items()}
+_ANY_ORDER |= _BEZIER
 
 # The corners of a pixel and of a voxel, in the order of a quadrilateral and of a hexahedron.
 _REORDERED = {"pixel": ("quad", [0, 1, 3, 2]), "voxel": ("hexahedron", [0, 1, 3, 2, 4, 5, 7, 6])}
@@ -79,7 +80,8 @@ def _block(path: Path, number: int, size: int, nodes: np.ndarray) -> CellBlock:
         shape = _ANY_ORDER[number]
         corners = SHAPES[shape][1]
         kind = shape if size == corners else f"{shape}{size}"
-        return _require_size(path, CellBlock(kind, nodes, kind), corners)
+        label = f"{BEZIER if number in _BEZIER else ''}{kind}"
+        return _require_size(path, CellBlock(kind, nodes, label), corners)
     if number in (2, 4, 0):  # points and lines of any length, empty cells: no volume and no surface
         return CellBlock("vertex", nodes[:, :1], "polyline" if number == 4 else "vertex")
     if number == 7 and size in (3, 4):

@@ -98,6 +98,9 @@ def _doubts(files: list[Path]) -> list[str]:
     steps = np.diff([float(text) for text in varied[0]])
     if steps.min() == steps.max():
         return []
+    if steps.min() == 0:
+        twice = int(np.argmin(steps))
+        return [f"{files[twice].name} and {files[twice + 1].name} have one number: is one a copy of the other?"]
     wide = int(np.argmax(steps > steps.min()))
     return [f"{files[wide + 1].name} follows {files[wide].name}: is a frame missing between them?"]
 

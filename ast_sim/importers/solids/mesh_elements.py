@@ -101,7 +101,7 @@ def _reduced(mesh: SourceMesh, chosen: list[int], corners: bool) -> list[str]:
     """Notes on the cells that keep their corners only, by kind."""
     counts: Counter[str] = Counter()
     for block in (mesh.blocks[index] for index in chosen):
-        if block.is_curved and (corners or block.kind != "tetra10"):
+        if block.is_curved and (corners or not block.has_middles):
             counts[block.label] += len(block.nodes)
     return [f"{count} cells of the kind {kind} keep their corners only" for kind, count in counts.items()]
 

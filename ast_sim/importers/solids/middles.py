@@ -23,7 +23,7 @@ _FARTHEST = 0.5
 
 def middles_of(block: CellBlock, point_of: np.ndarray) -> np.ndarray:
     """[c, 6]: the points in the middles of the edges of a block's cells, `NO_NODE` where cells have none."""
-    if block.kind != "tetra10":
+    if not block.has_middles:
         return np.full((len(block.nodes), len(MIDDLES)), NO_NODE)
     return point_of[block.nodes[:, 4:]]
 

@@ -86,7 +86,7 @@ def _fields(job: Job, frame: SourceMesh, wanted: Sequence[str]) -> dict[str, np.
     fields = {"displacement": np.asarray(frame.point_fields["DISP"], np.float64)[:, :3]}
     if "STRESS" in frame.point_fields:
         stress = np.asarray(frame.point_fields["STRESS"], np.float64)
-        order = order_of(frame.path, "STRESS", stress.shape[1], frame.columns.get("STRESS", ()), ())
+        order = order_of(frame.path, "STRESS", stress, frame.columns.get("STRESS", ()), ())
         fields["von_mises"] = von_mises(stress, order)
     for name in wanted:
         stored = _IN_RESULTS.get(name, name)

@@ -1,0 +1,152 @@
+"""Fields that may be read in two ways: the components of a stress, marks, points of Bezier cells, numbers of files."""
+
+import meshio
+import numpy as np
+import pytest
+import pyvista
+from blocks import block
+
+from ast_sim.importers.mesh_file import read_mesh
+from ast_sim.importers.series import FieldNames, read_series
+from ast_sim.importers.stress import are_components, parse_order
+from ast_sim.plausibility.motion import in_trajectory
+from ast_sim.simulate.shapes.mesh import second_order
+from ast_sim.support.errors import ConfigError, DatasetError
+
+CUBE = block(1, 1, 1)
+POINTS = CUBE.rest_position.astype(float)
+NODES, ELEMENTS = len(POINTS), len(CUBE.elements)
+TENSOR = {"xx": 1.0, "yy": 2.0, "zz": 4.0, "xy": 8.0, "yx": 8.0, "yz": 16.0, "zy": 16.0, "xz": 32.0, "zx": 32.0}
+IN_SPACE = float(np.sqrt(7 + 3 * (8**2 + 16**2 + 32**2)))
+OF_XDMF = ("xx", "xy", "xz", "yy", "yz", "zz")
+FULL = ("xx", "xy", "xz", "yx", "yy", "yz", "zx", "zy", "zz")
+
+
+def pressed(frame):
+    return POINTS * (0, 0, -0.1 * frame)
+
+
+def columns(order, frame):
+    return np.tile([frame * TENSOR[component] for component in order], (NODES, 1))
+
+
+def as_xdmf(folder, order):
+    with meshio.xdmf.TimeSeriesWriter(folder / "a.xdmf", data_format="XML") as writer:
+        writer.write_points_cells(POINTS, [("tetra", CUBE.elements)])
+        for frame in range(3):
+            fields = {"displacement": pressed(frame), "s": columns(order, frame)}
+            writer.write_data(frame, point_data=fields)
+    return folder / "a.xdmf"
+
+
+def as_vtu(folder, fields, of_cells=None, names="f_{}.vtu"):
+    for frame in range(3):
+        points = {"displacement": pressed(frame), **{name: make(frame) for name, make in fields.items()}}
+        cells = {name: [make(frame)] for name, make in (of_cells or {}).items()}
+        mesh = meshio.Mesh(POINTS, [("tetra", CUBE.elements)], point_data=points, cell_data=cells)
+        mesh.write(folder / names.format(frame))
+    return folder
+
+
+def read(source, **names):
+    return read_series(source, FieldNames(handle=names.pop("handle", "0:zmin"), **names))
+
+
+def notes(trajectory):
+    return str(trajectory.attributes.get("notes", ""))
+
+
+@pytest.mark.parametrize("order", [OF_XDMF, ("xx", "yy", "zz", "xy", "yz", "xz")])
+def test_six_components_in_xdmf_need_their_order(tmp_path, order):
+    """XDMF's Tensor6 has another order than programs in their arrays, and meshio writes arrays as they are."""
+    path = as_xdmf(tmp_path, order)
+    with pytest.raises(DatasetError, match=r"a.xdmf: the order of the 6 components of 's' is not certain: XDMF's own"):
+        read(path, stress="s")
+    assert read(path, stress="s", stress_order=order).stress[2].max() == pytest.approx(2 * IN_SPACE)
+
+
+def test_nine_components_in_xdmf_need_no_order(tmp_path):
+    assert read(as_xdmf(tmp_path, FULL), stress="s").stress[2].max() == pytest.approx(2 * IN_SPACE)
+
+
+@pytest.mark.parametrize("order", [("xx", "yy", "zz", "xy"), ("xx", "xy", "yx", "yy")])
+def test_four_components_of_which_two_are_equal_need_their_order(tmp_path, order):
+    source = as_vtu(tmp_path, {"s": lambda frame: columns(order, frame)})
+    if order[1] == "xy":
+        with pytest.raises(DatasetError, match="the second and the third are equal in all rows, as xy and yx are"):
+            read(source, stress="s")
+        assert read(source, stress="s", stress_order=order).stress[2].max() == pytest.approx(2 * np.sqrt(3 + 3 * 8**2))
+    else:
+        assert read(source, stress="s").stress[2].max() == pytest.approx(2 * np.sqrt(7 + 3 * 8**2))
+
+
+def test_no_stress_across_the_plane_is_no_doubt(tmp_path):
+    source = as_vtu(tmp_path, {"s": lambda frame: columns(("xx", "yy", "zz", "xy"), frame) * (1, 0, 0, 1)})
+    assert read(source, stress="s").stress[2].max() == pytest.approx(2 * np.sqrt(1 + 3 * 8**2))
+
+
+@pytest.mark.parametrize("text", ["xx,yy,zz,xy", "xx,xy,yx,yy", "xx,xy,xz,yy,yz,zz", ",".join(FULL)])
+def test_an_order_has_each_component_once(text):
+    order = parse_order(text)
+    for wrong in (order[1:], (order[1], *order[1:]), ("ab", *order[1:])):
+        with pytest.raises(ConfigError, match="is no order of the components of a stress"):
+            parse_order(",".join(wrong))
+
+
+def test_an_order_in_python_has_components_only(tmp_path):
+    source = as_vtu(tmp_path, {"s": lambda frame: columns(OF_XDMF, frame)})
+    with pytest.raises(DatasetError, match="a, b, c, d, e, f is no order of the components of 's'"):
+        read(source, stress="s", stress_order=tuple("abcdef"))
+
+
+def test_a_stress_in_fields_of_its_components_is_refused_with_what_to_write(tmp_path):
+    source = as_vtu(tmp_path, {f"stress_{one}": (lambda frame: np.ones(NODES)) for one in OF_XDMF})
+    with pytest.raises(DatasetError, match="no field 'stress_'; .*write them as one field, or the von Mises stress"):
+        read(source, stress="stress_")
+    assert not are_components(["displacement", "S_Mises", "max", "fix"])
+
+
+def test_a_stress_at_points_and_in_cells_is_told(tmp_path):
+    at_points = {"von_mises": lambda frame: np.full(NODES, 1.0 * frame)}
+    trajectory = read(as_vtu(tmp_path, at_points, {"von_mises": lambda frame: np.full(ELEMENTS, 7.0 * frame)}))
+    assert trajectory.stress.max() == 2 and trajectory.stress_at == "node"
+    assert "'von_mises' is a field of points and one of cells: the one of points is taken" in notes(trajectory)
+
+
+@pytest.mark.parametrize(("lowest", "count"), [(-1.0, 2 * NODES // 2), (-0.04, 0), (0.0, 0)])
+@pytest.mark.parametrize("at", ["node", "element"])
+def test_a_negative_von_mises_stress_is_told(tmp_path, lowest, count, at):
+    size = NODES if at == "node" else ELEMENTS
+    made = {"von_mises": lambda frame: frame * np.where(np.arange(size) % 2, 1.0, lowest)}
+    trajectory = read(as_vtu(tmp_path, made) if at == "node" else as_vtu(tmp_path, {}, made))
+    told = [one for one in in_trajectory(trajectory) if one.what == "stresses below zero"]
+    assert [one.count for one in told] == ([count * size // NODES] if count else [])
+    assert all("the lowest is -2 in frame 2" in str(one) for one in told)
+
+
+@pytest.mark.parametrize(("unmarked", "told"), [(-1, True), (0, False), (np.nan, False)])
+def test_marks_below_zero_are_told(tmp_path, unmarked, told):
+    mark = np.where(POINTS[:, 2] == 0, 1, unmarked)
+    trajectory = read(as_vtu(tmp_path, {"fix": lambda _: mark}), handle="fix")
+    assert trajectory.scene.prescribed.sum() == (NODES if told else NODES // 2)
+    assert (
+        "the field 'fix' is negative at 4 nodes: they are marked, as all where it is not 0" in notes(trajectory)
+    ) == told
+
+
+@pytest.mark.parametrize(("kind", "nodes"), [(24, 10), (71, 10), (78, 4)])
+def test_points_of_bezier_cells_are_no_nodes(tmp_path, kind, nodes):
+    """The curve of an edge passes beside its point in the middle, and fields have no values there."""
+    points, elements = second_order(POINTS, CUBE.elements)
+    cells = np.column_stack([np.full(len(elements), 10), elements]).ravel()
+    pyvista.UnstructuredGrid(cells, np.full(len(elements), kind), points).save(tmp_path / "a.vtu")
+    mesh = read_mesh(tmp_path / "a.vtu")
+    assert mesh.elements.shape == (ELEMENTS, nodes)
+    assert ("6 cells of the kind Bezier tetra10 keep their corners only" in mesh.notes) == (nodes == 4)
+
+
+@pytest.mark.parametrize("copy", ["f_01.vtu", "f_1.VTU", "f_001.vtu"])
+def test_two_files_of_one_number_are_told(tmp_path, copy):
+    source = as_vtu(tmp_path, {})
+    (source / copy).write_bytes((source / "f_1.vtu").read_bytes())
+    assert "have one number: is one a copy of the other?" in notes(read(source))
