@@ -84,13 +84,24 @@ def _beginning(path: Path) -> bytes:
 
 
 def _surface(path: Path) -> SourceMesh:
-    """The triangles of all solids of an STL file; corners at the same place are one point."""
+    """The triangles of all solids of an STL file; corners at the same place are one point, but corners of two solids
+    only if some solid is open: then they are patches of one surface."""
     try:
-        corners = read_stl(path).corners
+        stl = read_stl(path)
     except BadSurface as error:
         raise DatasetError(f"{path}: cannot be read as a mesh: {error}") from error
-    points, nodes = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
-    return SourceMesh(path, points, [CellBlock("triangle", nodes.reshape(-1, 3), "triangle")])
+    rows = stl.corners.reshape(-1, 3)
+    whole = all(_is_closed(stl.corners[stl.solid == solid]) for solid in np.unique(stl.solid))
+    keys = np.column_stack([rows, np.repeat(stl.solid, 3) if whole else np.zeros(len(rows))])
+    points, nodes = np.unique(keys, axis=0, return_inverse=True)
+    return SourceMesh(path, points[:, :3], [CellBlock("triangle", nodes.reshape(-1, 3), "triangle")])
+
+
+def _is_closed(corners: np.ndarray) -> bool:
+    """Whether each edge of triangles [t, 3, 3] is one of two triangles."""
+    nodes = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)[1].reshape(-1, 3)
+    edges = np.sort(nodes[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    return bool((np.unique(edges, axis=0, return_counts=True)[1] == 2).all())
 
 
 def _xdmf_frames(path: Path) -> Iterator[SourceMesh]:

@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 # Nodes lie on a line if their second extent, as a share of the first, is below this.
 _ON_A_LINE = 1e-3
 
+# Rounding to float32 may move points by this share of the shortest edge before a warning is given.
+_ROUNDING = 0.01
+
 Numbers = float | Sequence[float]
 
 
@@ -95,7 +98,20 @@ def read_scene(
         )
     scene.check(str(mesh.path))
     looks_wrong = [str(finding) for finding in at_rest(scene)]
-    return SceneMesh(scene, [*mesh.notes], [*doubts, *looks_wrong])
+    return SceneMesh(scene, [*mesh.notes], [*doubts, *_rounded(mesh, scene, used), *looks_wrong])
+
+
+def _rounded(mesh: MeshFile, scene: Scene, used: np.ndarray) -> list[str]:
+    """A warning if points far from the origin lie elsewhere as float32, by a share of an edge."""
+    off = float(np.abs(scene.rest_position - mesh.points[used]).max())
+    shortest = min(_shortest_edge(scene, int(body)) for body in np.unique(scene.body))
+    if off <= _ROUNDING * shortest:
+        return []
+    farthest = float(np.abs(scene.rest_position).max())
+    return [
+        f"rounding to float32 moves points by up to {off:.3g}, and the shortest edge is {shortest:.3g}: the mesh is too"
+        f" fine for coordinates of up to {farthest:.3g}; move it to the origin"
+    ]
 
 
 def describe(scene: Scene) -> list[str]:

@@ -2,13 +2,15 @@
 
 import subprocess
 import sys
-from dataclasses import fields
+from dataclasses import fields, replace
 
+import data_samples
 import meshio
 import numpy as np
 import pytest
 from meshes import plate_and_punch
 
+from ast_sim.importers.mesh_file import read_mesh
 from ast_sim.importers.scene_mesh import parse_clamp, parse_material, read_scene
 from ast_sim.scene import NodeType
 from ast_sim.support.errors import ConfigError, DatasetError
@@ -73,6 +75,43 @@ def test_an_stl_file_in_capitals_and_one_that_is_cut_off(tmp_path):
     (tmp_path / "b.stl").write_text(text[: len(text) // 2])
     with pytest.raises(DatasetError, match="b.stl: cannot be read as a mesh: it is cut off after"):
         read_scene(tmp_path / "b.stl")
+
+
+def surface(scene):
+    """The triangles of the surface of a scene as text, without the lines of a solid."""
+    facet = "facet normal 0 0 0\nouter loop\n{}endloop\nendfacet\n"
+    corners = scene.rest_position[scene.surface()]
+    return [facet.format("".join(f"vertex {x} {y} {z}\n" for x, y, z in one)) for one in corners.tolist()]
+
+
+@pytest.mark.parametrize("gap", [0.0, 0.5])
+def test_closed_solids_of_an_stl_file_are_bodies(tmp_path, gap):
+    """Where they touch, their corners are not joined."""
+    cube = data_samples.block(1, 1, 1)
+    above = replace(cube, rest_position=cube.rest_position + np.float32([0, 0, 1 + gap]))
+    parts = [f"solid {name}\n{''.join(surface(one))}endsolid\n" for name, one in (("low", cube), ("top", above))]
+    (tmp_path / "a.stl").write_text("".join(parts))
+    mesh = read_mesh(tmp_path / "a.stl")
+    assert len(mesh.points) == 16 and len(mesh.elements) == 24 and not mesh.notes
+    scene, _ = mesh.scene(None, None)
+    assert np.bincount(scene.body).tolist() == [8, 8]
+
+
+@pytest.mark.parametrize("cut", [1, 6])
+def test_patches_of_one_surface_in_an_stl_file_are_one_body(tmp_path, cut):
+    facets = surface(data_samples.block(1, 1, 1))
+    parts = [f"solid {name}\n{''.join(some)}endsolid\n" for name, some in (("a", facets[:cut]), ("b", facets[cut:]))]
+    (tmp_path / "a.stl").write_text("".join(parts))
+    mesh = read_mesh(tmp_path / "a.stl")
+    assert len(mesh.points) == 8 and len(mesh.elements) == 12
+
+
+@pytest.mark.parametrize(("away", "told"), [(0.0, False), (1e3, False), (1e6, True), (1e8, True)])
+def test_a_mesh_too_far_from_the_origin_for_float32_is_told(away, told):
+    cube = data_samples.block(1, 1, 1)
+    mesh = meshio.Mesh(cube.rest_position.astype(float) * 0.7 + away, [("tetra", cube.elements)])
+    read = read_scene(mesh, clamps=["0:xmin"])
+    assert any(one.startswith("rounding to float32 moves points by up to") for one in read.warnings) == told
 
 
 def test_a_flat_mesh_of_two_columns():
