@@ -20,7 +20,7 @@
 typedef enum {
   AST_OK = 0,
   AST_NO_MEMORY,  /* scratch memory could not be had; outputs are undefined */
-  AST_NOT_FINITE, /* octree: a position is NaN or infinite */
+  AST_NOT_FINITE, /* octree: a position is NaN or infinite; elastic_stiffness: a stretch is lost */
   AST_OUTSIDE,    /* octree: a position lies outside the cube; farthest_point_sample: a scene is 2^21 or more wide */
   AST_TOO_LARGE,  /* octree_coarsen: more cells than an int32 can number */
 } ast_status;
@@ -127,6 +127,14 @@ typedef struct {
   const float *position, *rest_position;               /* [N,3] */
   const float *lame;                                   /* [E,2]: lambda and mu */
 } ast_elastic;
+
+/* Elastic tetrahedra and what is known at their points, in double; elastic_stiffness.c has the formulas. */
+typedef struct {
+  int64_t E, Q, K;                        /* elements; points and nodes of each: 1 and 4, or 4 and 10 */
+  const double *F, *gradients;            /* [3,3,Q,E], [K,3,Q,E] of the shape functions */
+  const double *volume, *mu, *c, *spread; /* [Q,E] */
+  bool project;                           /* negative eigenvalues by F become zero */
+} ast_stiffness;
 
 /* Surfaces of bodies: triangles whose nodes belong to the body of the first, counter-clockwise seen from outside. */
 typedef struct {
@@ -257,6 +265,10 @@ typedef struct {
   ast_status (*elastic_forces)(const ast_elastic *s, float *restrict force);
   /* dposition [N,3] = (dforce/dposition) dforce, whose matrix is symmetric: the gradient. */
   ast_status (*elastic_forces_backward)(const ast_elastic *s, const float *restrict dforce, float *restrict dposition);
+  /* entries [3K (3K+1) / 2,E]: the second derivative of each element's energy by its positions, row by row of the upper
+   * triangle; row 3 a + i is component i of node a. AST_NOT_FINITE if a projected point is so flat that its stretch is
+   * lost in rounding, or if its numbers are not finite; entries are undefined then. */
+  ast_status (*elastic_stiffness)(const ast_stiffness *s, double *restrict entries);
   /* out [N,5]: the outward normal at the nearest point of another body of the scene, times 1 - |gap| / radius; then
    * gap / radius and gap / (0.1 radius), clipped to -1..1. The gap is negative inside the body. 0, 0, 0, 1, 1 if none
    * is nearer than the radius. Triangles without an area do not count. */
@@ -313,6 +325,7 @@ typedef struct {
   KERNEL(linear_backward)          \
   KERNEL(elastic_forces)           \
   KERNEL(elastic_forces_backward)  \
+  KERNEL(elastic_stiffness)        \
   KERNEL(proximity)                \
   KERNEL(breadth_first)            \
   KERNEL(counting_sort)            \

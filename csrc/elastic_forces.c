@@ -138,12 +138,9 @@ AST_INLINE void elastic_stress(vf lambda, vf mu, vf M[3][3], vf S[3][3]) {
 }
 
 /* D in double: the products of two edges are exact, so that D^-1 is rounded but once, however flat the element. Edges
- * of any float are in the range of their volumes, whatever the unit of length. */
-typedef double vd __attribute__((vector_size(2 * AST_VECTOR_BYTES)));
-typedef int64_t vl __attribute__((vector_size(2 * AST_VECTOR_BYTES)));
-#define ABS(x) ((vd)((vl)(x) & INT64_MAX))
-
-/* What the rest edges D of an element say: whether it counts, D^-1, and area = -V D^-T = -sign(det D) / 6 cof(D). */
+ * of any float are in the range of their volumes, whatever the unit of length.
+ *
+ * What the rest edges D of an element say: whether it counts, D^-1, and area = -V D^-T = -sign(det D) / 6 cof(D). */
 typedef struct {
   vi counts;
   vf D[3][3], inverse[3][3], area[3][3];
@@ -158,17 +155,17 @@ AST_INLINE elastic_rest elastic_measure(const float *rest, const int64_t *elemen
     const int i1 = (i + 1) % 3, i2 = (i + 2) % 3, j1 = (j + 1) % 3, j2 = (j + 2) % 3;
     const vd plus = D[i1][j1] * D[i2][j2], minus = D[i2][j1] * D[i1][j2];
     cofactor[i][j] = plus - minus;
-    if (j == 0) size += ABS(D[i][0]) * (ABS(plus) + ABS(minus));
+    if (j == 0) size += vmagnitude(D[i][0]) * (vmagnitude(plus) + vmagnitude(minus));
   }
   const vd det = D[0][0] * cofactor[0][0] + D[1][0] * cofactor[1][0] + D[2][0] * cofactor[2][0];
-  const vd per_det = 1.0 / det, sixth = ABS(det) * per_det * (-1.0 / 6);
+  const vd per_det = 1.0 / det, sixth = vmagnitude(det) * per_det * (-1.0 / 6);
   vf zero = {0}; /* NaN where an entry of the inverse is not finite */
   EACH(3, i) EACH(3, j) {
     r.inverse[j][i] = __builtin_convertvector(cofactor[i][j] * per_det, vf);
     r.area[i][j] = __builtin_convertvector(cofactor[i][j] * sixth, vf);
     zero += r.inverse[j][i] * 0.0f;
   }
-  r.counts = (__builtin_convertvector(ELASTIC_FLAT * size * ABS(per_det), vf) < 1) & (zero == 0);
+  r.counts = (__builtin_convertvector(ELASTIC_FLAT * size * vmagnitude(per_det), vf) < 1) & (zero == 0);
   return r;
 }
 

@@ -10,6 +10,7 @@
 #include "counting_sort.c"
 #include "breadth_first.c" /* after counting_sort.c */
 #include "elastic_forces.c"
+#include "elastic_stiffness.c"
 #include "fps.c"
 #include "linear.c"
 #include "attention_block.c" /* after attention.c and linear.c, of which it is made */

@@ -100,6 +100,62 @@ static PyObject *declare(PyObject *module, PyObject *arguments) {
   Py_RETURN_NONE;
 }
 
+/* ---- the stiffness of elastic tetrahedra, on arrays of NumPy: the solver knows no torch ---- */
+
+enum { STIFFNESS_ARRAYS = 7, STIFFNESS_TABLES = 3 };
+static const char *const stiffness_names[STIFFNESS_ARRAYS] = {"entries", "F", "gradients", "volume",
+                                                              "mu",      "c", "spread"};
+
+/* Whether the arrays fit together: those before STIFFNESS_TABLES end in the axis of the elements or points. */
+static bool take_stiffness(PyObject *const *objects, Py_buffer *arrays, int *taken, ast_stiffness *s) {
+  for (; *taken < STIFFNESS_ARRAYS; ++*taken) {
+    Py_buffer *a = &arrays[*taken];
+    const int writable = *taken ? 0 : PyBUF_WRITABLE;
+    if (PyObject_GetBuffer(objects[*taken], a, PyBUF_FORMAT | PyBUF_C_CONTIGUOUS | writable) != 0) return false;
+    const int ndim = *taken == 0 ? 2 : *taken < STIFFNESS_TABLES ? 3 : 1;
+    if (strcmp(a->format, "d") != 0 || a->ndim != ndim) {
+      PyErr_Format(PyExc_ValueError, "elastic_stiffness: %s must be float64 of %d axes", stiffness_names[*taken], ndim);
+      return ++*taken, false;
+    }
+  }
+  const Py_ssize_t K = arrays[2].shape[0], Q = K == 4 ? 1 : 4, E = arrays[0].shape[1];
+  bool fits = (K == 4 || K == 10) && arrays[0].shape[0] == 3 * K * (3 * K + 1) / 2 && arrays[1].shape[0] == 3;
+  for (int i = 1; i < STIFFNESS_ARRAYS; i++) fits &= arrays[i].shape[arrays[i].ndim - 1] == Q * E;
+  for (int i = 1; i < STIFFNESS_TABLES; i++) fits &= arrays[i].shape[1] == 3;
+  *s = (ast_stiffness){E,
+                       Q,
+                       K,
+                       arrays[1].buf,
+                       arrays[2].buf,
+                       .volume = arrays[3].buf,
+                       .mu = arrays[4].buf,
+                       .c = arrays[5].buf,
+                       .spread = arrays[6].buf};
+  if (!fits) PyErr_SetString(PyExc_ValueError, "elastic_stiffness: the shapes of the arrays do not fit together");
+  return fits;
+}
+
+/* elastic_stiffness(entries, F, gradients, volume, mu, c, spread, project) writes entries; whether all are known. */
+static PyObject *elastic_stiffness(PyObject *self, PyObject *const *objects, Py_ssize_t num) {
+  (void)self;
+  if (num != STIFFNESS_ARRAYS + 1)
+    return PyErr_Format(PyExc_TypeError, "elastic_stiffness takes %d arguments, not %zd", STIFFNESS_ARRAYS + 1, num);
+  const int project = PyObject_IsTrue(objects[STIFFNESS_ARRAYS]);
+  if (project < 0) return NULL;
+  Py_buffer arrays[STIFFNESS_ARRAYS];
+  int taken = 0;
+  ast_stiffness s;
+  ast_status status = AST_OK;
+  const bool fits = take_stiffness(objects, arrays, &taken, &s);
+  if (fits) {
+    s.project = project;
+    Py_BEGIN_ALLOW_THREADS status = float32_kernels->elastic_stiffness(&s, arrays[0].buf);
+    Py_END_ALLOW_THREADS
+  }
+  while (taken > 0) PyBuffer_Release(&arrays[--taken]);
+  return fits ? PyBool_FromLong(status == AST_OK) : NULL;
+}
+
 /* ---- the process ---- */
 
 /* The addresses of torch_parallel_for and torch_get_num_threads. */
@@ -157,6 +213,9 @@ static PyMethodDef methods[] = {
      "freeze(*indices): copies that kernels trust, or the arrays themselves if they are such."},
     {"values_read", (PyCFunction)(void (*)(void))values_read, METH_FASTCALL,
      "values_read(*objects): copies of what kernels read of frozen arrays that were written to since; else the same."},
+    {"elastic_stiffness", (PyCFunction)(void (*)(void))elastic_stiffness, METH_FASTCALL,
+     "elastic_stiffness(entries, F, gradients, volume, mu, c, spread, project): writes entries; whether all are "
+     "known."},
     {"set_pool", set_pool, METH_VARARGS,
      "set_pool(parallel_for, num_threads): addresses of torch's thread pool, 0 for serial."},
     {"keep_memory", keep_memory, METH_NOARGS, "Let the C library keep freed blocks; whether it had an effect."},

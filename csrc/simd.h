@@ -28,6 +28,8 @@ typedef float vf __attribute__((vector_size(AST_VECTOR_BYTES)));
 typedef int32_t vi __attribute__((vector_size(AST_VECTOR_BYTES)));
 typedef uint32_t vu __attribute__((vector_size(AST_VECTOR_BYTES)));
 typedef float vf_unaligned __attribute__((vector_size(AST_VECTOR_BYTES), aligned(4), may_alias));
+typedef double vd __attribute__((vector_size(2 * AST_VECTOR_BYTES))); /* VW doubles, in two registers */
+typedef int64_t vl __attribute__((vector_size(2 * AST_VECTOR_BYTES)));
 
 #define AST_INLINE static inline __attribute__((always_inline))
 /* A loop over i < n, a constant up to 16, written out. */
@@ -36,6 +38,8 @@ typedef float vf_unaligned __attribute__((vector_size(AST_VECTOR_BYTES), aligned
 AST_INLINE vf vload(const float *p) { return *(const vf_unaligned *)p; }
 AST_INLINE void vstore(float *p, vf x) { *(vf_unaligned *)p = x; }
 AST_INLINE vf vsplat(float x) { return x - (vf){0}; } /* x - 0 keeps -0 */
+
+AST_INLINE vd vmagnitude(vd x) { return (vd)((vl)x & INT64_MAX); }
 
 /* The first n < VW floats; the others are 0 and are not read. In pieces of fixed size: a copy of variable size is a
  * call. */

@@ -32,6 +32,7 @@ FAMILIES = (
     "attention",
     "segment",
     "elastic_forces",
+    "elastic_stiffness",
     "proximity",
     "mesh",
     "message",

@@ -22,7 +22,7 @@ FAMILIES = {
     "Farthest point sampling": ("farthest_point_sample",),
     "Octree": ("octree",),
     "Sums over segments": ("segment", "column_sum"),
-    "Elastic forces": ("elastic_forces",),
+    "Elastic forces and stiffness": ("elastic_forces", "elastic_stiffness"),
     "Distance to other bodies": ("proximity",),
     "Meshes": ("mesh_edges", "outer_faces", "counting_sort"),
 }

@@ -121,10 +121,6 @@ ROWS = {
     "parts400_transolver": Row(
         "Pairs of parts, 400 nodes, Transolver", steps=11_800, model="transolver", settings=_TURNED, **_PARTS
     ),
-    "parts400_long_transolver": Row(
-        "Pairs of parts, 400 nodes, Transolver, 42,500 steps", steps=42_500, model="transolver", settings=_TURNED,
-        **_PARTS,
-    ),
 }  # fmt: skip
 
 

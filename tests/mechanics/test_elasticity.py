@@ -3,13 +3,15 @@
 import numpy as np
 import pytest
 
-from ast_sim.mechanics.elements.elasticity import Elasticity, eigenvectors
+from ast_sim import _C
+from ast_sim.mechanics.elements.elasticity import Elasticity, stiffness
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean, cofactor, determinant, von_mises
 from ast_sim.mechanics.elements.second_order import LARGEST, elastic_body, shape_functions
 from ast_sim.mechanics.linear_algebra.linear_system import LinearSystem
 from ast_sim.mechanics.linear_algebra.sparsity import entry_dofs
 from ast_sim.simulate.shapes import mesh
 from ast_sim.support.errors import SimulationError
+from benchmarks.kernels.elastic_stiffness import by_numpy
 
 MATERIAL = NeoHookean(young=1e6, poisson=0.4)
 RUBBER = NeoHookean(young=1e6, poisson=0.499)  # in second-order elements, part of it acts on the mean dilatation
@@ -234,15 +236,54 @@ def test_an_inverted_element_has_infinite_energy_and_no_place_at_rest():
         elastic_body(rest, elements, MATERIAL)
 
 
-def test_rotations_of_many_matrices_find_their_eigenvectors():
-    """Also of matrices that differ by sixteen orders of magnitude, that have equal values, or that are zero."""
-    random = np.random.default_rng(2)
-    half = random.normal(size=(3, 3, 500)) * 10.0 ** random.integers(-8, 8, 500)
-    special = np.stack([np.zeros((3, 3)), np.eye(3), np.ones((3, 3)), np.diag([1.0, 1.0, 2.0])], axis=2)
-    matrices = np.concatenate([half + half.transpose(1, 0, 2), special], axis=2)
-    values, vectors = eigenvectors(matrices)
-    size = np.abs(matrices).max(axis=(0, 1)) + np.finfo(float).tiny
-    again = np.einsum("aie,ae,aje->ije", vectors, values, vectors)
-    assert np.abs((again - matrices) / size).max() < 1e-14
-    products = np.einsum("aie,bie->abe", vectors, vectors)
-    np.testing.assert_allclose(products, np.broadcast_to(np.eye(3)[:, :, None], products.shape), atol=1e-14)
+@pytest.mark.parametrize("project", [False, True])
+@pytest.mark.parametrize("nodes", [4, 10])
+def test_stiffness_follows_from_the_second_derivative_by_F(nodes, project):
+    """Also where stretches are equal, where an element is mirrored, and for numbers of any size."""
+    rng = np.random.default_rng(2)
+    count = 4 * 50
+    turns = np.linalg.qr(rng.normal(size=(2, count, 3, 3)))[0]
+    stretches = rng.choice([0.2, 0.9, 1.0, 1.0, 3.0], (count, 3))
+    F = np.einsum("pij,pj,pjk->ikp", turns[0], stretches, turns[1])  # no contiguous array
+    size = 10.0 ** rng.integers(-12, 12, count)
+    mu, c, spread = size * rng.uniform([0.1, -3, -1], [1, 3, 3], (count, 3)).T
+    volume, gradients = rng.uniform(0.1, 1, count), rng.normal(size=(nodes, 3, count))
+    found = stiffness(F, gradients, volume, mu, c, spread, project)
+    exact = by_numpy(F, gradients, volume, mu, c, spread, project)
+    assert (np.abs(found - exact).max(axis=0) <= 1e-12 * np.abs(exact).max(axis=0)).all()
+    some = stiffness(F[:, :, :4], gradients[:, :, :4], volume[:4], 2.0, c[:4], spread[:4], project)
+    np.testing.assert_array_equal(
+        some, stiffness(F[:, :, :4], gradients[:, :, :4], volume[:4], np.full(4, 2.0), c[:4], spread[:4], project)
+    )
+    assert stiffness(F[:, :, :0], gradients[:, :, :0], *4 * [np.zeros(0)], project).shape[1] == 0
+
+
+@pytest.mark.parametrize("first", [0.0, 1e-9, np.nan, np.inf])
+def test_a_lost_stretch_cannot_be_projected(first):
+    F = np.repeat(np.diag([1.0, 1.0, 1.0])[:, :, None], 20, axis=2)
+    F[0, 0, 17] = first
+    ones = np.ones(20)
+    arguments = F, np.ones((4, 3, 20)), ones, 1.0, ones, ones
+    stiffness(*arguments, False)
+    with pytest.raises(np.linalg.LinAlgError, match="lost in rounding"):
+        stiffness(*arguments, True)
+
+
+def test_the_core_refuses_arrays_that_do_not_fit_together():
+    F = np.repeat(np.eye(3)[:, :, None], 2, axis=2)
+    valid = [np.empty((78, 2)), F, np.ones((4, 3, 2)), *4 * [np.ones(2)], True]
+    assert _C.elastic_stiffness(*valid)
+    read_only = np.empty((78, 2))
+    read_only.flags.writeable = False
+    wrong = [
+        (0, read_only), (0, np.empty((77, 2))), (0, np.empty((78, 3))), (0, np.empty((465, 2))), (0, np.empty(156)),
+        (1, np.ones((3, 3, 2), np.float32)), (1, np.ones((3, 2, 2))), (1, np.ones((2, 3, 3)).T), (1, np.ones((9, 2))),
+        (2, np.ones((5, 3, 2))), (2, np.ones((10, 3, 2))), (2, np.ones((4, 2, 2))), (2, np.ones((4, 3, 0))),
+        (3, np.ones(1)), (4, np.ones(4)[::2]), (5, np.ones(2, ">f8")), (6, np.ones((2, 1))), (6, 1.0), (6, None),
+    ]  # fmt: skip
+    for place, value in wrong:
+        with pytest.raises((TypeError, ValueError, BufferError)):
+            _C.elastic_stiffness(*valid[:place], value, *valid[place + 1 :])
+    for count in (0, 7, 9):
+        with pytest.raises(TypeError, match="takes 8 arguments"):
+            _C.elastic_stiffness(*(2 * valid)[:count])

@@ -8,23 +8,14 @@ entry of an element's stiffness lands in the global matrix. Legend: N nodes, E e
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
+from ast_sim import _C
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean, cofactor, determinant, von_mises
 from ast_sim.mechanics.linear_algebra.sparsity import Entries
 from ast_sim.support.errors import SimulationError
-
-# The 78 entries (p, q), p <= q, of an element's symmetric 12 x 12 stiffness; p = 3 a + i for component i of node a.
-_ROW, _COLUMN = np.triu_indices(12)
-_ENTRY = np.zeros((12, 12), int)
-_ENTRY[_ROW, _COLUMN] = _ENTRY[_COLUMN, _ROW] = np.arange(len(_ROW))
-# Entry of the pair with the two nodes exchanged and the components kept: (a i, b j) -> (b i, a j).
-_SWAPPED = _ENTRY[3 * (_COLUMN // 3) + _ROW % 3, 3 * (_ROW // 3) + _COLUMN % 3]
-SWEEPS = 12  # of rotations, at most
-VANISHING = np.errstate(under="ignore")  # products of numbers near zero are zero, whatever a program wants to be told
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,9 +53,6 @@ class Elasticity:
         self.gradients = np.concatenate([-gradients.sum(0)[None], gradients])  # [4, 3, E]
         self._nodes = np.ascontiguousarray(elements.T)
         self._dofs = (3 * self._nodes[:, None, :] + np.arange(3)[None, :, None]).reshape(12, -1)
-        dot = np.einsum("aje,bje->abe", self.gradients, self.gradients)
-        same_component = _ROW % 3 == _COLUMN % 3
-        self._constant = material.mu * self.volume * dot[_ROW // 3, _COLUMN // 3] * same_component[:, None]  # [78, E]
 
     @property
     def unit_force(self) -> float:
@@ -108,47 +96,21 @@ class Elasticity:
     def hessian(self, deformation: Deformation, project: bool = False) -> np.ndarray:
         """Second derivative of each element's energy as its 78 upper entries [78 E], entry by entry.
 
-        With g_a = F^-T grad N_a the block of nodes a, b is
-
-            K_ab = V [mu (grad N_a . grad N_b) I + lambda J^2 g_a (x) g_b - c g_b (x) g_a],  c = lambda/2 (J^2 - 1) - mu
-
-        (from dP = mu dF + lambda J^2 (F^-T : dF) F^-T - c F^-T dF^T F^-T).
-
         Args:
             deformation: the deformation at the positions in question.
             project: replace the negative eigenvalues of d2 psi / dF2 by zero in each element.
+
+        Raises:
+            numpy.linalg.LinAlgError: the eigenvalues of an element are lost in rounding (`stiffness`).
         """
         J = deformation.J
-        g = np.einsum("ije,aje->aie", deformation.cofactor / J, self.gradients).reshape(12, -1)
-        products = g[_ROW]
-        products *= g[_COLUMN]
-        entries = products[_SWAPPED]
-        entries *= -self.volume * self.material.pressure_factor(J)
-        products *= self.volume * self.material.lam * J * J
-        entries += products
-        entries += self._constant
-        if project:
-            self._lift(entries, deformation)
-        return entries.ravel()
+        law = self.material
+        arguments = self.gradients, self.volume, law.mu, law.pressure_factor(J), law.lam * J * J
+        return stiffness(deformation.F, *arguments, project).ravel()
 
     def entries(self) -> tuple[Entries]:
         """Of `hessian`."""
-        return (Entries(self._nodes, _ROW, _COLUMN),)
-
-    @VANISHING
-    def _lift(self, entries: np.ndarray, deformation: Deformation) -> None:
-        """Add to the entries [78,E] of each element what makes the negative eigenvalues of d2 psi / dF2 zero."""
-        material, J = self.material, deformation.J
-        arguments = material.mu, material.pressure_factor(J), material.lam * J * J
-        for elements, direction, value in negative_directions(deformation, *arguments, self.gradients):
-            b = direction.reshape(12, -1)
-            # Of all elements: to pick the elements that have any takes twice as long.
-            whole = np.zeros((12, entries.shape[1]))
-            whole[:, elements] = b * np.sqrt(value * self.volume[elements])
-            first = 0
-            for row in range(12):
-                entries[first : first + 12 - row] += whole[row] * whole[row:]
-                first += 12 - row
+        return (Entries(self._nodes, *np.triu_indices(3 * len(self._nodes))),)
 
     def cauchy(self, deformation: Deformation) -> np.ndarray:
         """True stress of each element [3,3,E] in pascal."""
@@ -169,85 +131,42 @@ class Elasticity:
         return np.divide(total, volume, out=np.zeros(self.num_nodes), where=volume > 0)
 
 
-def negative_directions(
-    deformation: Deformation, mu: float | np.ndarray, c: np.ndarray, spread: np.ndarray, gradients: np.ndarray
-) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Where the second derivative of an energy by F has negative eigenvalues.
+def stiffness(
+    F: np.ndarray,
+    gradients: np.ndarray,
+    volume: np.ndarray,
+    mu: float | np.ndarray,
+    c: np.ndarray,
+    spread: np.ndarray,
+    project: bool,
+) -> np.ndarray:
+    """Second derivative of each element's energy by its nodes, from the P points of E elements.
 
-    The derivative is mu I + spread F^-T (x) F^-T - c (dF -> F^-T dF^T F^-T). With F = sum_i s_i u_i v_i^T, its
-    eigenvectors are of two kinds (Smith et al. 2019). For each axis k the other two, i and j, have the twist
-    u_i v_j^T - u_j v_i^T with the eigenvalue mu + c s_k / J, and the flip u_i v_j^T + u_j v_i^T with mu - c s_k / J. At
-    most one of them is negative. The other three are sum_i w_i u_i v_i^T, with w an eigenvector of
+    With g_a = F^-T grad N_a the block of nodes a, b is the sum over the points of
 
-        A_ij = delta_ij (mu - c / s_i^2) + spread / (s_i s_j),
+        K_ab = V [mu (grad N_a . grad N_b) I + spread g_a (x) g_b - c g_b (x) g_a].
 
-    which has no negative eigenvalue unless c is positive or spread is negative.
+    For Ciarlet's law, dP = mu dF + lambda J^2 (F^-T : dF) F^-T - c F^-T dF^T F^-T, so spread is lambda J^2 and c is
+    `NeoHookean.pressure_factor`. `csrc/elastic_stiffness.c` has the projection (Smith et al. 2019).
 
     Args:
-        mu, c, spread: of each of the E deformations. For Ciarlet's law, c is `pressure_factor` and spread lambda J^2.
-        gradients: [a,3,E] of the shape functions.
+        F: [3,3,P] the deformation gradients, P = E for 4 nodes and 4 E for 10: the first points of all elements first.
+        gradients: [nodes,3,P] of the shape functions.
+        volume, mu, c, spread: [P] of each point.
+        project: replace the negative eigenvalues of the bracket, as a function of F, by zero at each point.
 
-    Yields:
-        Numbers [n] of deformations, an eigenvector as the change of F with the nodes, [a,3,n], and minus its eigenvalue
-        [n], with which it is to be added times itself: twists and flips have the length sqrt(2), so theirs is halved.
-
-    Raises:
-        numpy.linalg.LinAlgError: an element is longer than flat by more than 1e7, or its deformation is not finite.
-    """
-    J = deformation.J
-    squares, right = eigenvectors(np.einsum("kie,kje->ije", deformation.F, deformation.F))
-    if (squares.min(axis=0) <= np.finfo(float).eps * squares.max(axis=0)).any():
-        raise np.linalg.LinAlgError("an element is so flat that its stretch is lost in rounding")
-    stretch = np.sqrt(squares)
-    left = np.einsum("ije,kje->kie", deformation.F, right) / stretch[:, None]
-    across = np.einsum("aje,kje->kae", gradients, right)  # v_k . grad N_a
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        value = mu - np.abs(c) * stretch[k] / J
-        below = np.flatnonzero(value < 0)
-        one, other = (across[x][:, None, below] * left[y][None, :, below] for x, y in ((j, i), (i, j)))
-        yield below, one + np.sign(c[below]) * other, -value[below] / 2
-    widened = np.flatnonzero((c > 0) | (spread < 0))
-    inverse = 1 / stretch[:, widened]
-    A = spread[widened] * inverse[:, None] * inverse[None]
-    A[range(3), range(3)] += np.broadcast_to(mu, J.shape)[widened] - c[widened] * inverse * inverse
-    for value, weight in zip(*eigenvectors(A), strict=True):
-        below = np.flatnonzero(value < 0)
-        chosen = widened[below]
-        yield (
-            chosen,
-            np.einsum("ke,kae,kie->aie", weight[:, below], across[:, :, chosen], left[:, :, chosen]),
-            -value[below],
-        )
-
-
-@VANISHING
-def eigenvectors(matrices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Eigenvalues [3,E], in no order, and eigenvectors [axis,3,E] of symmetric matrices [3,3,E].
-
-    By Jacobi's rotations of all matrices at once, which take half the time of LAPACK, matrix by matrix. They converge
-    quadratically: four or five sweeps.
+    Returns:
+        [entries,E] the upper triangle, row by row; row 3 a + i is component i of node a.
 
     Raises:
-        numpy.linalg.LinAlgError: a number is not finite.
+        numpy.linalg.LinAlgError: to project, an element is longer than flat by more than 1e7, or its deformation is not
+            finite.
     """
-    if not np.isfinite(matrices).all():
-        raise np.linalg.LinAlgError("a matrix without finite numbers has no eigenvalues")
-    diagonal = [matrices[i, i].copy() for i in range(3)]
-    beside = [matrices[1, 2].copy(), matrices[0, 2].copy(), matrices[0, 1].copy()]  # by the third axis
-    vectors = [np.broadcast_to(axis[:, None], matrices.shape[1:]) for axis in np.eye(3)]
-    rounding = np.finfo(float).eps * np.abs(matrices).max(axis=(0, 1), initial=0)
-    for _ in range(SWEEPS):
-        if all((np.abs(one) <= rounding).all() for one in beside):
-            break
-        for p, q, r in ((0, 1, 2), (0, 2, 1), (1, 2, 0)):
-            half = (diagonal[q] - diagonal[p]) / 2
-            length = np.abs(half) + np.sqrt(half * half + beside[r] * beside[r])
-            tangent = np.copysign(beside[r], beside[r] * half) / np.maximum(length, np.finfo(float).tiny)
-            cosine = 1 / np.sqrt(1 + tangent * tangent)
-            sine = tangent * cosine
-            diagonal[p] -= tangent * beside[r]
-            diagonal[q] += tangent * beside[r]
-            beside[r] = np.zeros_like(cosine)
-            beside[q], beside[p] = cosine * beside[q] - sine * beside[p], sine * beside[q] + cosine * beside[p]
-            vectors[p], vectors[q] = cosine * vectors[p] - sine * vectors[q], sine * vectors[p] + cosine * vectors[q]
-    return np.stack(diagonal), np.stack(vectors)
+    rows = 3 * len(gradients)
+    num_elements = len(volume) if len(gradients) == 4 else len(volume) // 4
+    entries = np.empty((rows * (rows + 1) // 2, num_elements))
+    of_points = (np.broadcast_to(one, len(volume)) for one in (volume, mu, c, spread))
+    arrays = map(np.ascontiguousarray, (F, gradients, *of_points))
+    if not _C.elastic_stiffness(entries, *arrays, project):
+        raise np.linalg.LinAlgError("the stretch of an element is lost in rounding, or not finite")
+    return entries

@@ -15,23 +15,17 @@ pads are 10 to 30 % too soft on coarse meshes (docs/log.md, 2026-11-26).
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 
 from ast_sim.element_topology import MIDDLES
-from ast_sim.mechanics.elements.elasticity import Deformation, Elasticity, negative_directions
+from ast_sim.mechanics.elements.elasticity import Deformation, Elasticity, stiffness
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean, cofactor, determinant, von_mises
-from ast_sim.mechanics.linear_algebra.sparsity import Entries
 from ast_sim.support.errors import SimulationError
 
 LARGEST = 20.0
 # Gauss's rule of degree 2: barycentric coordinates [point, corner]; each point has a quarter of the volume.
 _FAR, _NEAR = (5 - 5**0.5) / 20, (5 + 3 * 5**0.5) / 20
 POINTS = np.full((4, 4), _FAR) + (_NEAR - _FAR) * np.eye(4)
-_ELEMENTS_AT_ONCE = 256  # whose stiffness fits into the cache
-# The 465 entries (p, q), p <= q, of an element's symmetric 30 x 30 stiffness; p = 3 a + i for component i of node a.
-_ROW, _COLUMN = np.triu_indices(30)
 
 
 def shape_functions(weights: np.ndarray) -> np.ndarray:
@@ -105,8 +99,6 @@ class SecondOrder(Elasticity):
         at_points = np.minimum(lam, LARGEST * mu)
         self._mean_lam = lam - at_points  # [E], what is left for the mean dilatation
         self.material = NeoHookean.of_lame(np.tile(at_points, 4), np.tile(mu, 4))
-        weighted = gradients * mu * volume
-        self._constant = np.einsum("aipe,bipe->eab", weighted, gradients, optimize=True)  # [E, 10, 10]
 
     @property
     def element_volume(self) -> np.ndarray:
@@ -167,38 +159,16 @@ class SecondOrder(Elasticity):
         mean = self._mean_dilatation(deformation.J)
         pressure = self._mean_pressure(J) * J
         spread, c = material.lam * J * J + pressure, material.pressure_factor(J) + pressure
-        g = np.einsum("ijp,ajp->aip", deformation.cofactor / J, self.gradients).reshape(30, 4, -1)
-        b = np.einsum("npe,pe->ne", g, (self.volume * J).reshape(4, -1))
+        entries = stiffness(deformation.F, self.gradients, self.volume, material.mu, c, spread, project)
         stiff = self._mean_lam * (1 + 1 / (mean * mean)) / 2 / self._element_volume
-        directions = np.ascontiguousarray(np.concatenate([g, b[:, None]], axis=1).transpose(2, 0, 1))  # [E, 30, 5]
-        direct = np.concatenate([(self.volume * spread).reshape(4, -1), stiff[None]]).T  # [E, 5]
-        turned = -(self.volume * c).reshape(4, -1).T  # [E, 4]
-        entries = np.empty((self._count, len(_ROW)))
-        for start in range(0, self._count, _ELEMENTS_AT_ONCE):
-            chunk = slice(start, start + _ELEMENTS_AT_ONCE)
-            blocks = (directions[chunk] * direct[chunk, None]) @ directions[chunk].transpose(0, 2, 1)  # [n, 30, 30]
-            at_points = directions[chunk, :, :4]
-            crossed = (at_points * turned[chunk, None]) @ at_points.transpose(0, 2, 1)
-            blocks += crossed.reshape(-1, 10, 3, 10, 3).swapaxes(2, 4).reshape(blocks.shape)
-            for i in range(3):
-                blocks[:, i::3, i::3] += self._constant[chunk]
-            entries[chunk] = blocks[:, _ROW, _COLUMN]
-        if project:
-            self._lift(entries, negative_directions(deformation, material.mu, c, spread, self.gradients))
-        return entries.T.ravel()
-
-    def entries(self) -> tuple[Entries]:
-        """Of `hessian`."""
-        return (Entries(self._nodes, _ROW, _COLUMN),)
-
-    def _lift(self, entries: np.ndarray, negative: Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> None:
-        """Add to the entries [E,465] of each element what makes the negative eigenvalues at its points zero."""
-        for points, direction, value in negative:
-            b = direction.reshape(30, -1)
-            scale = value * self.volume[points]
-            for point in range(4):  # an element has only one of each, so the sums below lose nothing
-                at = points // self._count == point
-                entries[points[at] % self._count] += ((b[:, at] * scale[at])[_ROW] * b[_COLUMN][:, at]).T
+        if stiff.any():
+            by_point = np.einsum("ijp,ajp->aip", deformation.cofactor * self.volume, self.gradients)
+            b = self._summed(by_point).reshape(30, -1)
+            first = 0
+            for row in range(30):
+                entries[first : first + 30 - row] += stiff * b[row] * b[row:]
+                first += 30 - row
+        return entries.ravel()
 
     def cauchy(self, deformation: Deformation) -> np.ndarray:
         """True stress of each element [3,3,E] in pascal: the mean over its rest volume."""
