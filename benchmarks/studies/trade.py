@@ -46,7 +46,7 @@ ROWS = {
     "plates400": Row("Plates, 400 nodes", "plates", 40, {**DEEP_PLATES, "nodes": 400, "seed": 912}),
     "plates1300": Row("Plates, 1,300 nodes", "plates1300", 15),
     "plates1300_second_order": Row("Plates, 1,300 nodes, second-order", "plates1300_second_order", 15),
-    "parts400": Row("Pairs of parts, 400 nodes, with friction", "parts400", 15),
+    "parts400": Row("Pairs of parts, 400 nodes, with friction", "parts400_long", 15),
     "snap_hook": Row("Snap hook, second-order elements, with friction", "snap_hook", 15),
     "bumper": Row("Bumper, 1,600 nodes, with friction", "bumper", 15),
 }
