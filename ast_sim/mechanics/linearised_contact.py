@@ -25,13 +25,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse
 
-from ast_sim.mechanics.elements.elasticity import Deformation
-from ast_sim.mechanics.elements.neo_hookean import NeoHookean, cofactor, determinant
+from ast_sim.mechanics.elements.elasticity import Deformation, upright
+from ast_sim.mechanics.elements.neo_hookean import NeoHookean
 from ast_sim.mechanics.elements.second_order import elastic_body
 from ast_sim.mechanics.linear_algebra.compliance import Compliance, compliance_of
 from ast_sim.mechanics.linear_algebra.linear_system import LinearSystem
@@ -52,7 +52,6 @@ ROUNDED = 1e-12  # an overlap of this part of the deepest is rounding
 PATIENCE, MOST_PIVOTS = 3, 30  # turns of all wrong pairs without fewer of them; turns in all, for each pair
 SLID = 0.02  # surfaces have slid along this last part of the path from rest to x, if nothing else is known
 SWEEPS, CHANGE = 100, 1e-3  # forces of friction are found when a sweep over the pairs changes them by less
-FLATTEST = 0.2  # the least stretch of an element that forces and stiffness follow
 TINY = 1e-300  # instead of zero in a denominator
 STILL = 0.05  # a step of this size (`NewtonSteps.size`) or less is the last one (docs/log.md, 2026-11-25)
 SLIGHT = 1e-3  # a displacement below this, in mean edge lengths, is none: before bodies touch, only rounding is left
@@ -111,6 +110,7 @@ class NewtonSteps:
         nodes = np.unique(faces)
         self.watch: Callable[[int], None] = lambda forces: None
         self._shortening = 1.0  # the share of the last step that was made
+        self._evaluated: tuple[np.ndarray, Deformation] | None = None
         self._surfaces = [(faces[owner == body], nodes[scene.body[nodes] != body]) for body in np.unique(owner)]
 
     def step(self, position: np.ndarray, from_afar: bool = False, stuck: np.ndarray | None = None) -> np.ndarray:
@@ -136,7 +136,7 @@ class NewtonSteps:
 
     def _stepped(self, position: np.ndarray, from_afar: bool, stuck: np.ndarray | None) -> np.ndarray:
         """See `step`."""
-        deformation = _upright(self.elasticity.evaluate(position))
+        deformation = upright(self._deformation(position))
         force = self.elasticity.gradient(deformation)[0].ravel()[self.system.free]
         pairs = self.near_pairs(position, stuck)
         directions = pairs.directions if self._friction else pairs.directions[: len(pairs.gap)]
@@ -148,6 +148,12 @@ class NewtonSteps:
         else:
             raise SimulationError("the stiffness is singular: nothing holds a body, or an element has collapsed")
         return self._shortened(position, self._constrained(compliance, force, pairs))
+
+    def _deformation(self, position: np.ndarray) -> Deformation:
+        """The deformation at positions [N, 3]; a step begins where the one before has looked for turned elements."""
+        if self._evaluated is None or not np.array_equal(position, self._evaluated[0]):
+            self._evaluated = position.copy(), self.elasticity.evaluate(position)
+        return self._evaluated[1]
 
     def size(self, before: np.ndarray, after: np.ndarray) -> float:
         """The size of the last step, between positions [N, 3]: the larger of the largest component of a move, in mean
@@ -203,7 +209,7 @@ class NewtonSteps:
 
     def von_mises(self, position: np.ndarray, location: str) -> np.ndarray:
         """[N, 1] or [E, 1] float32: the stress in pascal at `location`, "node" or "element"; 0 in rigid bodies."""
-        stress = self.elasticity.von_mises(self.elasticity.evaluate(position), location)
+        stress = self.elasticity.von_mises(self._deformation(position), location)
         if location == "node":
             return stress.astype(np.float32)[:, None]
         of_elements = np.zeros((self._scene.num_elements, 1), np.float32)
@@ -270,24 +276,9 @@ class NewtonSteps:
             moved = position.ravel().copy()
             moved[self.system.free] += share * step
             moved = moved.reshape(-1, 3)
-            if share <= SMALLEST or self.elasticity.evaluate(moved).J.min() > 0:
+            if share <= SMALLEST or self._deformation(moved).J.min() > 0:
                 return moved
             share /= 2
-
-
-def _upright(deformation: Deformation) -> Deformation:
-    """The deformation with no element flatter than `FLATTEST`: F = U S V^T with U and V rotations, S raised to it."""
-    bad = np.flatnonzero((deformation.J < FLATTEST) | ~np.isfinite(deformation.J))
-    if not len(bad):
-        return deformation
-    left, stretch, right = np.linalg.svd(np.moveaxis(deformation.F[:, :, bad], 2, 0))
-    for rotation, axis in ((left, (slice(None), slice(None), 2)), (right, (slice(None), 2))):
-        mirrored = np.linalg.det(rotation) < 0
-        rotation[axis] *= np.where(mirrored, -1, 1)[:, None]
-    F = deformation.F.copy()
-    F[:, :, bad] = np.moveaxis((left * np.maximum(stretch, FLATTEST)[:, None, :]) @ right, 0, 2)
-    cofactors = cofactor(F)
-    return replace(deformation, F=F, J=determinant(F, cofactors), cofactor=cofactors)
 
 
 def _tangents(normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -8,7 +8,7 @@ entry of an element's stiffness lands in the global matrix. Legend: N nodes, E e
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,6 +16,8 @@ from ast_sim import _C
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean, cofactor, determinant, von_mises
 from ast_sim.mechanics.linear_algebra.sparsity import Entries
 from ast_sim.support.errors import SimulationError
+
+FLATTEST = 0.2  # the least stretch that `upright` leaves
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,6 +133,21 @@ class Elasticity:
         return np.divide(total, volume, out=np.zeros(self.num_nodes), where=volume > 0)
 
 
+def upright(deformation: Deformation) -> Deformation:
+    """The deformation with no element flatter than `FLATTEST`: F = U S V^T with U and V rotations, S raised to it."""
+    bad = np.flatnonzero((deformation.J < FLATTEST) | ~np.isfinite(deformation.J))
+    if not len(bad):
+        return deformation
+    left, stretch, right = np.linalg.svd(np.moveaxis(deformation.F[:, :, bad], 2, 0))
+    for rotation, axis in ((left, (slice(None), slice(None), 2)), (right, (slice(None), 2))):
+        mirrored = np.linalg.det(rotation) < 0
+        rotation[axis] *= np.where(mirrored, -1, 1)[:, None]
+    F = deformation.F.copy()
+    F[:, :, bad] = np.moveaxis((left * np.maximum(stretch, FLATTEST)[:, None, :]) @ right, 0, 2)
+    cofactors = cofactor(F)
+    return replace(deformation, F=F, J=determinant(F, cofactors), cofactor=cofactors)
+
+
 def stiffness(
     F: np.ndarray,
     gradients: np.ndarray,
@@ -159,8 +176,7 @@ def stiffness(
         [entries,E] the upper triangle, row by row; row 3 a + i is component i of node a.
 
     Raises:
-        numpy.linalg.LinAlgError: to project, an element is longer than flat by more than 1e7, or its deformation is not
-            finite.
+        numpy.linalg.LinAlgError: to project, one stretch of an element is 7e7 times another, or not finite.
     """
     rows = 3 * len(gradients)
     num_elements = len(volume) if len(gradients) == 4 else len(volume) // 4
