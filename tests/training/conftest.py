@@ -3,7 +3,7 @@
 import pytest
 import toy
 
-from ast_sim.runs import folder as run_folder
+from ast_sim.models import registry
 from ast_sim.training import loop
 
 
@@ -11,7 +11,7 @@ from ast_sim.training import loop
 def linear(monkeypatch):
     """The linear model in the place of AST."""
     monkeypatch.setattr(loop, "build_model", toy.LinearSimulator)
-    monkeypatch.setattr(run_folder, "build_model", toy.LinearSimulator)
+    monkeypatch.setattr(registry, "build_model", toy.LinearSimulator)
 
 
 @pytest.fixture(scope="module")
