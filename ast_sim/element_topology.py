@@ -82,6 +82,11 @@ def triangle_sides(triangles: np.ndarray) -> np.ndarray:
     return np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
 
 
+def is_closed(triangles: np.ndarray) -> bool:
+    """Whether each side of the triangles [F, 3] is one of two of them."""
+    return bool((np.unique(triangle_sides(triangles), axis=0, return_counts=True)[1] == 2).all())
+
+
 def unit_normals(corners: np.ndarray) -> np.ndarray:
     """[F, 3] of length one, for triangles with these corners [F, 3, 3]; 0 for a triangle without an area."""
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from ast_sim.element_topology import is_closed
 from ast_sim.importers.decks.deck_mesh import deck_mesh
 from ast_sim.importers.formats.gmsh_fields import has_steps
 from ast_sim.importers.formats.gmsh_files import gmsh_frames
@@ -91,17 +92,10 @@ def _surface(path: Path) -> SourceMesh:
     except BadSurface as error:
         raise DatasetError(f"{path}: cannot be read as a mesh: {error}") from error
     rows = stl.corners.reshape(-1, 3)
-    whole = all(_is_closed(stl.corners[stl.solid == solid]) for solid in np.unique(stl.solid))
-    keys = np.column_stack([rows, np.repeat(stl.solid, 3) if whole else np.zeros(len(rows))])
-    points, nodes = np.unique(keys, axis=0, return_inverse=True)
+    points, nodes = np.unique(rows, axis=0, return_inverse=True)
+    if all(is_closed(nodes.reshape(-1, 3)[stl.solid == solid]) for solid in np.unique(stl.solid)):
+        points, nodes = np.unique(np.column_stack([rows, np.repeat(stl.solid, 3)]), axis=0, return_inverse=True)
     return SourceMesh(path, points[:, :3], [CellBlock("triangle", nodes.reshape(-1, 3), "triangle")])
-
-
-def _is_closed(corners: np.ndarray) -> bool:
-    """Whether each edge of triangles [t, 3, 3] is one of two triangles."""
-    nodes = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)[1].reshape(-1, 3)
-    edges = np.sort(nodes[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    return bool((np.unique(edges, axis=0, return_counts=True)[1] == 2).all())
 
 
 def _xdmf_frames(path: Path) -> Iterator[SourceMesh]:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ast_sim.element_topology import LOCAL_FACES
+from ast_sim.element_topology import LOCAL_FACES, is_closed
 from ast_sim.number_arrays import connected_parts
 
 # The thickness of the layer, in mean edge lengths.
@@ -124,8 +124,7 @@ def _looks_out(points: np.ndarray, triangles: np.ndarray, tetrahedra: np.ndarray
     tetrahedra are on both sides, or the shell is open."""
     import igl
 
-    edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    if (np.unique(edges, axis=0, return_counts=True)[1] != 2).any():
+    if not is_closed(triangles):
         return 0
     _, first = np.unique(connected_parts(tetrahedra, len(points))[tetrahedra[:, 0]], return_index=True)
     used, corners = np.unique(triangles, return_inverse=True)
