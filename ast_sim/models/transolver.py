@@ -159,7 +159,7 @@ class Transolver(Simulator):
 
     def inputs_of(self, batch: Batch, use: Use = Normalizer.__call__) -> tuple[Tensor, Tensor]:
         """See `Simulator`: of the nodes, and their positions at rest and now from the centre of the domain, [N, 6]."""
-        center = batch.position.new_tensor(self.config.data.domain_center * 2)
+        center = batch.position.new_tensor(self.config.data.domain_center * 2, dtype=torch.float32)
         positions = torch.cat([batch.graph.rest_position, batch.position], dim=1) - center
         return use(self.node_inputs, node_features(self.config, batch)), use(self.positions, positions)
 
