@@ -72,10 +72,7 @@ class Row:
 _SETTINGS = {"peak_rate": 2e-3, "validate_scenes": 10, "validate_every": 500, "checkpoint_every": 500}
 _BUMPER, _HOOK = (ROOT / "examples" / name / "SPEC.toml" for name in ("bumper", "snap_hook"))
 ROWS = {
-    "bumper": Row("Bumper, 1,600 nodes", _BUMPER, nodes=1600, train=100, steps=1700, settings=_SETTINGS),
-    "bumper_50": Row(
-        "Bumper, 50 scenes", _BUMPER, nodes=1600, train=50, steps=1700, settings=_SETTINGS, solver_scenes=0
-    ),
+    "bumper": Row("Bumper, second-order elements", _BUMPER, nodes=None, train=100, steps=1700, settings=_SETTINGS),
     "snap_hook": Row("Snap hook, second-order elements", _HOOK, nodes=None, train=200, steps=1000, settings=_SETTINGS),
     "bumper_6000": Row(
         "Bumper, 6,000 nodes, after the small ones",
