@@ -51,6 +51,7 @@ class Row:
         steps, settings: of the training.
         solver_scenes: the number of test scenes in which the solver is run.
         after: the row whose run this training starts from.
+        scenes: the row whose scenes it takes; None: its own.
     """
 
     title: str
@@ -63,6 +64,7 @@ class Row:
     settings: dict[str, Any] = field(default_factory=dict)
     solver_scenes: int = 10
     after: str | None = None
+    scenes: str | None = None
 
     def run_folder(self, name: str, folder: Path) -> Path:
         """Where the run of the row of that name lies."""
@@ -74,6 +76,16 @@ _BUMPER, _HOOK = (ROOT / "examples" / name / "SPEC.toml" for name in ("bumper", 
 ROWS = {
     "bumper": Row("Bumper, second-order elements", _BUMPER, nodes=None, train=100, steps=1700, settings=_SETTINGS),
     "snap_hook": Row("Snap hook, second-order elements", _HOOK, nodes=None, train=200, steps=1000, settings=_SETTINGS),
+    "snap_hook_transolver": Row(
+        "Snap hook, Transolver",
+        _HOOK,
+        nodes=None,
+        train=200,
+        steps=1200,
+        settings={**_SETTINGS, "model": "transolver"},
+        solver_scenes=0,
+        scenes="snap_hook",
+    ),
     "bumper_6000": Row(
         "Bumper, 6,000 nodes, after the small ones",
         _BUMPER,
@@ -93,7 +105,7 @@ def trained(name: str, folder: Path) -> tuple[ast_sim.Run, Path]:
     """The run of a row and its dataset; what is there already is not made again."""
     row = ROWS[name]
     data = ast_sim.generate(
-        "assembly", folder / f"{name}.h5", spec=row.spec, train=row.train, valid=row.valid, test=row.test,
+        "assembly", folder / f"{row.scenes or name}.h5", spec=row.spec, train=row.train, valid=row.valid, test=row.test,
         nodes=row.nodes, workers=1,
     ).path  # fmt: skip
     start = None if row.after is None else ROWS[row.after].run_folder(row.after, folder)

@@ -34,12 +34,14 @@ class Row:
         run: the name of an example run, or of a row of `benchmarks.studies.jumps` or `benchmarks.studies.assembly`.
         scenes: how many are measured.
         plates: the settings of `generate` for fresh plates, which chose nothing; None: the test scenes of the row.
+        beside: the row of another model that was trained on the same scenes for the same time.
     """
 
     title: str
     run: str
     scenes: int
     plates: dict[str, Any] | None = None
+    beside: str | None = None
 
 
 ROWS = {
@@ -47,19 +49,26 @@ ROWS = {
     "plates1300": Row("Plates, 1,300 nodes", "plates1300", 15),
     "plates1300_second_order": Row("Plates, 1,300 nodes, second-order", "plates1300_second_order", 15),
     "parts400": Row("Pairs of parts, 400 nodes, with friction", "parts400_long", 15),
-    "snap_hook": Row("Snap hook, second-order elements, with friction", "snap_hook", 15),
-    "bumper": Row("Bumper, 1,600 nodes, with friction", "bumper", 15),
+    "parts400_10000": Row(
+        "Pairs of parts, 10,000 steps, beside Transolver", "parts400", 15, beside="parts400_transolver"
+    ),
+    "snap_hook": Row("Snap hook, second-order elements, with friction", "snap_hook", 15, beside="snap_hook_transolver"),
+    "bumper": Row("Bumper, second-order elements, with friction", "bumper", 15),
 }
 
 
 def measured(name: str, folder: Path) -> dict[str, Any]:
     """The figures of a row."""
     run, data, made_from = _run_and_data(name, folder)
+    beside = ROWS[name].beside
+    others = [] if beside is None else [_trained(beside, folder)[0]]
     command = f"python -m benchmarks.studies.trade {name}"
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of Newton steps that do not end: their errors count
         scenes = ROWS[name].scenes
-        by_quantity = ast_sim.trade(run, data, scenes=scenes, made_from=made_from, command=command).to_json()
+        by_quantity = ast_sim.trade(
+            run, data, scenes=scenes, beside=others, made_from=made_from, command=command
+        ).to_json()
     for figures in by_quantity.values():
         figures["origin"] |= {"run": run.path.name, "data": Path(data).name}
     return by_quantity
@@ -71,9 +80,12 @@ def _run_and_data(name: str, folder: Path) -> tuple[ast_sim.Run, Path, Path | No
     if row.plates is not None:
         data = ast_sim.generate(out=folder / f"{name}_fresh.h5", train=0, valid=0, test=row.scenes, **row.plates).path
         return ast_sim.example_run(row.run), data, None
-    if row.run in jumps.ROWS:
-        return *jumps.trained(row.run, folder), None
-    return *assembly.trained(row.run, folder), assembly.ROWS[row.run].spec
+    return *_trained(row.run, folder), None if row.run in jumps.ROWS else assembly.ROWS[row.run].spec
+
+
+def _trained(name: str, folder: Path) -> tuple[ast_sim.Run, Path]:
+    """The run of a row of `benchmarks.studies.jumps` or `benchmarks.studies.assembly`, and its dataset."""
+    return (jumps if name in jumps.ROWS else assembly).trained(name, folder)
 
 
 def page(results: dict[str, Any]) -> str:
