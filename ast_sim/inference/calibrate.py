@@ -21,6 +21,7 @@ from ast_sim.inference.promises.known_weights import require_known_weights
 from ast_sim.inference.quantities.band import LEVEL, Comparison, compared
 from ast_sim.inference.quantities.relative_errors import moves
 from ast_sim.inference.trained_run import Run
+from ast_sim.named_field import REACTION
 from ast_sim.runs.scope import spacing_of
 from ast_sim.scene import Trajectory
 from ast_sim.simulate.jobs.fastest_solver import deepest_frame
@@ -116,7 +117,7 @@ def _measured(run: Run, dataset: Dataset, split: str, progress: ShowProgress) ->
     to_choose = choices(run.settings.model, run.settings.train.corrections)
     efforts = to_choose if run.effort in to_choose else (*to_choose, run.effort)
     scenes: list[_Measured] = []
-    fields = [name for name, *_ in run.settings.model.data.fields]
+    fields = [REACTION, *(name for name, *_ in run.settings.model.data.fields)]
     names = [f"{split}/{index:06d}" for index in range(dataset.count(split))]
     left_out = [name for index, name in enumerate(names) if not _counts(run, dataset.load(split, index, fields), name)]
     _require_enough(len(names), len(left_out))

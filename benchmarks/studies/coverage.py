@@ -19,13 +19,14 @@ import numpy as np
 from scipy.stats import betabinom
 
 import ast_sim
+from ast_sim.inference.effort import Effort
 from ast_sim.inference.promises.familiarity import UNUSUAL
 from ast_sim.inference.quantities.band import LEVEL, compared
 from ast_sim.simulate.jobs.fastest_solver import deepest_frame
 from ast_sim.support.errors import ConfigError
 from ast_sim.support.provenance import provenance
 from benchmarks.studies import assembly
-from benchmarks.studies.coverage_page import page
+from benchmarks.studies.coverage_page import LEVELS, page
 from benchmarks.studies.rows import study_rows
 from benchmarks.studies.trade import DEEP_PLATES
 
@@ -87,11 +88,12 @@ def scenes(name: str, folder: Path, which: str) -> Path:
 def measured(name: str, folder: Path) -> dict[str, Any]:
     """The figures of a row."""
     run = ROWS[name].run(folder)
-    truths = _loaded(scenes(name, folder, "fresh"))
+    truths, path = _loaded(scenes(name, folder, "fresh")), scenes(name, folder, "calibration")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what they tell is counted
-        calibration = ast_sim.calibrate(run, scenes(name, folder, "calibration"), "test")
-        rows = [row for effort in calibration.efforts for row in bands(run, truths, effort)]
+        calibration = ast_sim.calibrate(run, path, "test")
+        calibrating = _loaded(path)
+        rows = [row for effort in calibration.efforts for row in bands(run, calibrating, truths, effort)]
         promised = promises(run, truths)
         ordinary = [(truth.scene, truth.position) for truth in truths]
         kinds = {"fresh scenes": ordinary, **strange(name, truths[:STRANGE], folder)}
@@ -106,32 +108,60 @@ def _loaded(path: Path) -> list[ast_sim.Trajectory]:
         return [data["test"][index] for index in range(data.count("test"))]
 
 
-def bands(run: ast_sim.Run, truths: Sequence[ast_sim.Trajectory], effort: ast_sim.Effort) -> list[dict[str, Any]]:
+def bands(
+    run: ast_sim.Run, calibrating: Sequence[ast_sim.Trajectory], truths: Sequence[ast_sim.Trajectory], effort: Effort
+) -> list[dict[str, Any]]:
     """How the bands of an effort hold in fresh scenes, a row for each quantity."""
     assert run.calibration is not None
-    result = run.calibration
-    answers = [(run.predict(truth, effort=effort, throw=False), truth) for truth in truths]
-    known = [(answer, compared(answer, truth)) for answer, truth in answers if answer.bands]
-    rank = int(np.ceil((result.scenes + 1) * LEVEL - 1e-9))
-    low, high = betabinom(len(known), rank, result.scenes + 1 - rank).interval(0.99)
+    measured = [(answer, compared(answer, truth)) for answer, truth in _answers(run, truths, effort) if answer.bands]
+    known = [
+        None if answer.failure else compared(answer, truth)
+        for answer, truth in _answers(run, calibrating, effort)
+        if not _is_outside(answer)
+    ]
+    assert len(known) == run.calibration.scenes
     rows = []
-    for quantity, width in known[0][0].bands.items():
-        scores = [comparisons[quantity].score(width.typical) for _, comparisons in known]
-        widest = [width.around(answer, quantity).max() for answer, _ in known]
-        errors = [comparisons[quantity].errors.max() for _, comparisons in known]
+    for quantity, band in measured[0][0].bands.items():
+        scores = sorted(np.inf if one is None else one[quantity].score(band.typical) for one in known)
+        fresh = [comparisons[quantity].score(band.typical) for _, comparisons in measured]
+        widest = float(np.median([band.around(answer, quantity).max() for answer, _ in measured]))
+        levels = {}
+        for level in LEVELS:
+            rank = int(np.ceil((len(scores) + 1) * level - 1e-9))
+            low, high = betabinom(len(fresh), rank, len(scores) + 1 - rank).interval(0.99)
+            width = scores[rank - 1]
+            levels[f"{level:g}"] = {
+                "width": width,
+                "held": sum(score <= width for score in fresh),
+                "held_interval_99": [int(low), int(high)],
+                "median_band": widest * width / band.width,
+            }
+        assert levels[f"{LEVEL:g}"]["width"] == band.width
         rows.append({
             "effort": effort.text,
             "quantity": quantity,
-            "quantile": width.width,
-            "typical": width.typical,
-            "fresh_scenes": len(known),
-            "without_band": len(truths) - len(known),
-            "held": sum(score <= width.width for score in scores),
-            "held_interval_99": [int(low), int(high)],
-            "median_band": float(np.median(widest)),
-            "median_largest_error": float(np.median(errors)),
+            "typical": band.typical,
+            "fresh_scenes": len(fresh),
+            "without_band": len(truths) - len(fresh),
+            "levels": levels,
+            "median_largest_error": float(np.median([one[quantity].errors.max() for _, one in measured])),
         })  # fmt: skip
     return rows
+
+
+def _answers(
+    run: ast_sim.Run, truths: Sequence[ast_sim.Trajectory], effort: Effort
+) -> list[tuple[ast_sim.Answer, ast_sim.Trajectory]]:
+    return [(run.predict(truth, effort=effort, throw=False), truth) for truth in truths]
+
+
+def _is_outside(answer: ast_sim.Answer) -> bool:
+    """Whether the scene is outside the ranges of the training. (A scene may be unlike the calibration scenes, too.)"""
+    return len(answer.notes) > _is_unlike(answer)
+
+
+def _is_unlike(answer: ast_sim.Answer) -> bool:
+    return answer.p_value is not None and answer.p_value <= UNUSUAL
 
 
 def strange(name: str, truths: Sequence[ast_sim.Trajectory], folder: Path) -> dict[str, list[Question]]:
@@ -196,13 +226,11 @@ def _beam(height: float) -> Question:
 def unusual(run: ast_sim.Run, questions: Sequence[Question]) -> dict[str, int]:
     """The number of questions, for the last frame by one call; of them the number outside the ranges of the
     training, the number that the network finds unlike the calibration scenes, and the number told by either."""
-    answers = [run.predict(*one, frames=[-1], effort=ast_sim.Effort(), throw=False) for one in questions]
-    unlike = [one.p_value is not None and one.p_value <= UNUSUAL for one in answers]
-    outside = [len(one.notes) > alike for one, alike in zip(answers, unlike, strict=True)]
+    answers = [run.predict(*one, frames=[-1], effort=Effort(), throw=False) for one in questions]
     return {
         "questions": len(answers),
-        "outside": sum(outside),
-        "unlike": sum(unlike),
+        "outside": sum(map(_is_outside, answers)),
+        "unlike": sum(map(_is_unlike, answers)),
         "told": sum(bool(one.notes) for one in answers),
     }
 
@@ -247,12 +275,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _said(result: dict[str, Any]) -> str:
-    least = min(result["rows"], key=lambda row: row["held"] / row["fresh_scenes"])
+    least = min(result["rows"], key=lambda row: _held(row) / row["fresh_scenes"])
     told = "; ".join(
         f"{kind}: {counts['told']} of {counts['questions']} told" for kind, counts in result["told"].items()
     )
-    held = f"bands held in {least['held']} of {least['fresh_scenes']} at least ({least['quantity']}, {least['effort']})"
+    held = f"bands held in {_held(least)} of {least['fresh_scenes']} at least ({least['quantity']}, {least['effort']})"
     return f"{held}; {told}"
+
+
+def _held(row: dict[str, Any]) -> int:
+    return row["levels"][f"{LEVEL:g}"]["held"]
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import ast_sim
+from ast_sim.inference.quantities.band import compared
 from ast_sim.named_field import REACTION
 
 
@@ -40,3 +41,16 @@ def test_the_true_reactions_of_a_file_are_the_force_of_the_true_positions(plate)
     true = replace(answer, position=truth.position, fields=truth.fields)
     np.testing.assert_allclose(true.reaction(), replace(true, fields={}).reaction(), rtol=2e-3, atol=0.05)
     assert np.linalg.norm(true.reaction(), axis=1)[1:] == pytest.approx(truth.attributes["reaction"][1:], rel=1e-4)
+
+
+@pytest.mark.parametrize("effort", [ast_sim.Effort(), ast_sim.Effort(newton_steps=1)])
+def test_a_force_is_compared_with_the_stored_one(plate, effort):
+    """Of data that follow another law than ours, or in which a tool presses on held nodes: positions do not tell."""
+    run, truth = plate
+    stored = truth.fields[REACTION]
+    other = replace(truth, fields={REACTION: replace(stored, values=3 * stored.values)})
+    answer = run.predict(truth, effort=effort)
+    force = np.linalg.norm(answer.reaction()[-1] - other.fields[REACTION].values[-1, answer.driven.nodes].sum(axis=0))
+    true = 3 * truth.attributes["reaction"][-1]
+    assert answer.errors(other)["reaction"] == pytest.approx(force / true, rel=1e-3)
+    assert compared(answer, other)["reaction"].errors[-1] == pytest.approx(force, rel=1e-3)

@@ -26,6 +26,7 @@ from ast_sim.inference.evaluation.deepest_frames import deepest_predicted
 from ast_sim.inference.predicting.question import Question, fields_of
 from ast_sim.inference.quantities.relative_errors import moves, relative_distance
 from ast_sim.models.simulator import Simulator
+from ast_sim.named_field import REACTION
 from ast_sim.scene import Scene, Trajectory
 from ast_sim.simulate.own_assembly.parameters import Values, values_of
 from ast_sim.support.errors import ConfigError, MissingExtra, require
@@ -213,7 +214,7 @@ def _complete(model: Simulator, dataset: Dataset) -> Iterator[DeepestTruth]:
 
 
 def _sample(model: Simulator, dataset: Dataset, split: str, index: int) -> DeepestTruth:
-    fields = [name for name, *_ in model.config.data.fields]
+    fields = [REACTION, *(name for name, *_ in model.config.data.fields)]
     return DeepestTruth.of(model, dataset.info, dataset.load(split, index, fields))
 
 

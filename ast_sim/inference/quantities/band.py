@@ -9,11 +9,12 @@ hardly anything moves have errors that are large beside their size, and would ma
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ast_sim.inference.quantities.relative_errors import truth_in_place
 from ast_sim.number_arrays import percent
 from ast_sim.scene import Trajectory
 from ast_sim.support.errors import ConfigError
@@ -57,10 +58,7 @@ class Comparison:
 
 def compared(answer: Answer, truth: Trajectory) -> dict[str, Comparison]:
     """Each quantity that the scene has, in the answer of a run and in all frames of the same motion."""
-    rows = list(answer.frames)
-    fields = {name: one.select(rows) for name, one in truth.fields.items()}
-    stress = None if truth.stress is None else truth.stress[rows]
-    true = replace(answer, position=truth.position[rows], stress=stress, fields=fields)
+    true = truth_in_place(answer, truth, list(answer.frames))
     result = {}
     for quantity, values in VALUES.items():
         try:
