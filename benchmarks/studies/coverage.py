@@ -172,7 +172,7 @@ def strange(name: str, truths: Sequence[ast_sim.Trajectory], folder: Path) -> di
     if name == "plates":
         return kinds | _changed_plates(truths)
     (other,) = {"snap_hook", "bumper"} - {name}
-    strangers = _loaded(scenes(other, folder, "fresh"))[:STRANGE]
+    strangers = _loaded(assembly.trained(other, folder)[1])[:STRANGE]
     return kinds | {f"{ROWS[other].title} in its place": [(one.scene, one.position) for one in strangers]}
 
 
