@@ -6,7 +6,7 @@ Legend: N nodes, E elements, B scenes.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -38,7 +38,13 @@ class State:
     @staticmethod
     def concatenate(states: Sequence[State]) -> State:
         """The states of several scenes as one."""
-        return State(*(_join(states, key.name) for key in fields(State)))
+        return State(
+            position=torch.cat([state.position for state in states]),
+            previous=_joined([state.previous for state in states]),
+            stress=_joined([state.stress for state in states]),
+            source=_joined([state.source for state in states]),
+            history=_joined([state.history for state in states]),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,18 +79,29 @@ class Batch:
             prescribed_position: [N, 3], of the prescribed nodes in the frame to predict. Other rows are not read.
         """
         motion = torch.where(graph.prescribed[:, None], prescribed_position - state.position, 0.0)
-        known = {"source": state.source, "history": state.history}
-        return Batch(graph, state.position, state.previous, motion, state.stress, names, **known)
+        return Batch(
+            graph=graph,
+            position=state.position,
+            previous_position=state.previous,
+            boundary_motion=motion,
+            stress=state.stress,
+            names=names,
+            source=state.source,
+            history=state.history,
+        )
 
     @staticmethod
     def concatenate(batches: Sequence[Batch]) -> Batch:
         """Several batches as one."""
         return Batch(
-            Graph.concatenate([batch.graph for batch in batches]),
-            *(_join(batches, key) for key in ("position", "previous_position", "boundary_motion", "stress")),
-            [name for batch in batches for name in batch.names],
-            source=_join(batches, "source"),
-            history=_join(batches, "history"),
+            graph=Graph.concatenate([batch.graph for batch in batches]),
+            position=torch.cat([batch.position for batch in batches]),
+            previous_position=_joined([batch.previous_position for batch in batches]),
+            boundary_motion=torch.cat([batch.boundary_motion for batch in batches]),
+            stress=_joined([batch.stress for batch in batches]),
+            names=[name for batch in batches for name in batch.names],
+            source=_joined([batch.source for batch in batches]),
+            history=_joined([batch.history for batch in batches]),
         )
 
     def placed(self, placement: Placement) -> Batch:
@@ -128,7 +145,7 @@ class Target:
         return Target(placement.vectors(self.motion), placed)
 
 
-def _join(parts: Sequence[State | Batch], key: str) -> Tensor | None:
-    """One attribute of all parts, concatenated; None if they do not have it."""
-    values = [getattr(part, key) for part in parts]
-    return None if values[0] is None else torch.cat(values)
+def _joined(parts: Sequence[Tensor | None]) -> Tensor | None:
+    """The parts of all scenes, concatenated; None unless all scenes have one."""
+    known = [part for part in parts if part is not None]
+    return torch.cat(known) if len(known) == len(parts) else None

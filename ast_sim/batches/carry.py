@@ -12,7 +12,7 @@ from functools import cache
 import numpy as np
 import scipy.sparse
 import torch
-from scipy.linalg.lapack import dpbtrf, dpbtrs
+from scipy.linalg import get_lapack_funcs
 from scipy.sparse.linalg import splu
 
 from ast_sim.element_topology import LOCAL_EDGES, linear_elements
@@ -24,6 +24,8 @@ RIGID = 1e-3  # prescribed nodes move as a rigid body if no node is farther off,
 LOOSE = 1e-13  # is added to the diagonal, as a share of the largest entry: far below the rounding of positions
 LARGEST_BAND = 50_000_000  # numbers, of 8 bytes
 PLANAR = 1e-6  # points lie on a line if their second extent, as a share of the first, is below this
+
+_factor_of_band, _solution_of_band = get_lapack_funcs(("pbtrf", "pbtrs"))
 
 
 class Carrier:
@@ -132,8 +134,8 @@ def _solver_of_band(
     count = len(diagonal)
     band = np.bincount(low * width + high - low, values, minlength=count * width).reshape(count, width)
     band[:, 0] = diagonal
-    factor, failed = dpbtrf(band.T, lower=1, overwrite_ab=1)
-    return None if failed else lambda right: dpbtrs(factor, right, lower=1)[0]
+    factor, failed = _factor_of_band(band.T, lower=1, overwrite_ab=1)
+    return None if failed else lambda right: _solution_of_band(factor, right, lower=1)[0]
 
 
 def _solver_of_sparse(

@@ -47,8 +47,9 @@ class Graph:
         material: [E, m] float32 or None.
         node_material: [N, m] float32, the mean over the elements at each node, or None.
         node_offsets, element_offsets: [B + 1] int64, where each scene's nodes and elements start and end.
-        m2m: node to node, every element edge in both directions; None with element nodes.
-        e2m, m2e: element to each of its nodes, and the reverse; None without element nodes.
+        edges: from node to node, every element edge in both directions; with element nodes from each element to its
+            nodes.
+        m2e: from each node to its elements; None without element nodes.
         rest_edges: [M, 4] float32, `edge_vectors` of `edges` at rest. An element is at the mean of its nodes.
         body: [N] int64, the number of each node's body in its scene.
         surface: [F, 3] int64, boundary triangles, counter-clockwise seen from outside; None if it is not needed.
@@ -67,11 +68,10 @@ class Graph:
     node_material: Tensor | None
     node_offsets: Tensor
     element_offsets: Tensor
-    m2m: EdgeSet | None
-    e2m: EdgeSet | None
+    edges: EdgeSet
     m2e: EdgeSet | None
     rest_edges: Tensor
-    body: Tensor | None = None
+    body: Tensor
     surface: Tensor | None = None
     surface_offsets: Tensor | None = None
     elasticity: ElasticTetrahedra | None = None
@@ -82,7 +82,7 @@ class Graph:
         """The graph of one scene.
 
         Args:
-            element_nodes: elements are nodes of the graph too: it has e2m and m2e, not m2m.
+            element_nodes: elements are nodes of the graph too.
             surface: the graph has the surface.
             elastic: the material of its tetrahedra; the graph has their elasticity.
         """
@@ -91,16 +91,17 @@ class Graph:
         rest = torch.tensor(scene.rest_position)
         node_type = torch.from_numpy(scene.node_type.astype("int64"))
         material = None if scene.material is None else torch.tensor(scene.material)
-        m2m = e2m = m2e = None
         if element_nodes:
             nodes = elements.reshape(-1)
             owners = torch.arange(e).repeat_interleave(elements.shape[1])
-            e2m = EdgeSet.from_pairs(owners, nodes, e, n)
+            edges = EdgeSet.from_pairs(owners, nodes, e, n)
             m2e = EdgeSet.from_pairs(nodes, owners, n, e)
-            rest_edges = edge_vectors(e2m, _element_mean(elements, rest), rest)
+            rest_edges = edge_vectors(edges, _element_mean(elements, rest), rest)
         else:
-            m2m = mesh_edges(elements, n)
-            rest_edges = edge_vectors(m2m, rest, rest)
+            edges = mesh_edges(elements, n)
+            m2e = None
+            rest_edges = edge_vectors(edges, rest, rest)
+        triangles, triangle_offsets = _surface_of(scene, elements) if surface else (None, None)
         return Graph(
             rest_position=rest,
             node_type=node_type,
@@ -112,12 +113,12 @@ class Graph:
             node_material=None if material is None else _node_mean(elements, material, n),
             node_offsets=torch.tensor([0, n]),
             element_offsets=torch.tensor([0, e]),
-            m2m=m2m,
-            e2m=e2m,
+            edges=edges,
             m2e=m2e,
             rest_edges=rest_edges,
             body=torch.from_numpy(scene.body.astype("int64")),
-            **(_surface_of(scene, elements) if surface else {}),
+            surface=triangles,
+            surface_offsets=triangle_offsets,
             elasticity=None if elastic is None else ElasticTetrahedra.of(scene, elastic),
         )
 
@@ -157,11 +158,6 @@ class Graph:
     def num_scenes(self) -> int:
         return len(self.node_offsets) - 1
 
-    @property
-    def edges(self) -> EdgeSet:
-        """The edges that have features: e2m with element nodes, else m2m."""
-        return self.m2m if self.e2m is None else self.e2m
-
     @cached_property
     def prescribed(self) -> Tensor:
         """[N] bool: the nodes whose positions are given at all times (obstacles and handles)."""
@@ -195,15 +191,16 @@ class Graph:
         return torch.cat(columns, dim=1)
 
 
-def _surface_of(scene: Scene, elements: Tensor) -> dict[str, Tensor]:
-    """As `Scene.surface`, whose NumPy the rooms without torch share; the kernel takes a seventh at 1,300 nodes."""
+def _surface_of(scene: Scene, elements: Tensor) -> tuple[Tensor, Tensor]:
+    """The surface and its offsets, as `Scene.surface`, whose NumPy the rooms without torch share; the kernel takes a
+    seventh at 1,300 nodes."""
     if elements.shape[1] == 3:
         triangles = elements
     else:
         outer = outer_faces(elements, scene.num_nodes).numpy()
         oriented = triangles_of_faces(scene.elements, outer, scene.rest_volumes)
         triangles = torch.from_numpy(oriented.astype("int64"))
-    return {"surface": triangles, "surface_offsets": torch.tensor([0, len(triangles)])}
+    return triangles, torch.tensor([0, len(triangles)])
 
 
 def edge_vectors(edges: EdgeSet, senders: Tensor, receivers: Tensor) -> Tensor:

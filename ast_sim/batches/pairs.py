@@ -252,7 +252,9 @@ class PairSampler:
         if jumps and pair.source_error is not None:
             before = before + pair.source_error * member.noisy
         (after,), next_stress = self._dataset.frames(self._split, pair.index, frame, frame + 1)
-        position, previous, motion = (self._jump if jumps else self._step)(pair, member, before, after)
+        position, previous, motion = (
+            self._jump(pair, member, before, after) if jumps else self._step(pair, member, before, after)
+        )
         known = self._values(member, stress, -1, source)
         state = State(torch.from_numpy(position), previous, known.get(STRESS))
         if self.scheme.history is not None:
@@ -274,6 +276,7 @@ class PairSampler:
         if jump.error is not None:
             guess = after + jump.error * member.noisy
         else:
+            assert member.carry is not None  # it is made for models that jump
             start = member.carry(before[-1], after)
             guess = start if jump.share == 1 else after + np.float32(jump.share) * (start - after)
         return guess, None, after - guess

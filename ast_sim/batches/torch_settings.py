@@ -11,6 +11,7 @@ from contextlib import ExitStack, contextmanager, nullcontext
 from threading import Lock
 
 import torch
+from torch.backends.mkldnn import MkldnnModule
 
 _EXACT = ("none", "ieee")  # what torch calls products of float32 that are made in float32
 
@@ -26,7 +27,7 @@ class _Shared:
     @contextmanager
     def exact_products(self) -> Iterator[None]:
         """Within the block torch multiplies float32 in float32."""
-        chosen = torch.backends.mkldnn.matmul
+        chosen = MkldnnModule.matmul
         with self._lock:
             self._inside += 1
             if self._before is None and chosen.fp32_precision not in _EXACT:

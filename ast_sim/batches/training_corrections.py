@@ -39,12 +39,12 @@ class _Guess(Jump):
     last: int = 1
     then: int | None = None
 
-    def take_next(self) -> None:
-        """Jump from the frame that was predicted to the frame `then`."""
-        self.source, self.frame, self.then = self.frame, self.then, None
+    def go_to(self, frame: int) -> None:
+        """Jump to a frame from the one that was predicted."""
+        self.source, self.frame, self.then = self.frame, frame, None
 
 
-class JumpPool(TrainingPool):
+class JumpPool(TrainingPool[_Guess]):
     """Jumps that are corrected side by side; see `TrainingPool` for the other arguments.
 
     A jump leads from `PairSampler.source`, or in some cases from a later frame, to a frame that is drawn; after
@@ -91,8 +91,8 @@ class JumpPool(TrainingPool):
     def restore(self, state: dict[str, Tensor]) -> None:
         super().restore(state)
         for guess in self._going.values():
-            if guess.source_error is not None:
-                guess.take_next()
+            if guess.source_error is not None and guess.then is not None:
+                guess.go_to(guess.then)
         self._squares = state["squares"].numpy().copy()
 
     def _start(self, index: int, first: bool, generator: np.random.Generator) -> _Guess:
@@ -107,11 +107,14 @@ class JumpPool(TrainingPool):
         placement = self._sampler.random_placement(index, generator)
         return _Guess(index, path[0], path[1], placement, last=last, then=path[2] if len(path) > 2 else None)
 
+    def _frames(self, place: int, scene: _Guess) -> _Guess:
+        return scene
+
     def _goes_on(self, scene: _Guess, error: np.ndarray) -> bool:
         scene.call, scene.error = scene.call + 1, error
         if self._lost(error):
             return False
         if scene.call == scene.last and scene.then is not None:
-            scene.take_next()
+            scene.go_to(scene.then)
             scene.call, scene.error, scene.source_error = 0, None, error
         return scene.call < scene.last

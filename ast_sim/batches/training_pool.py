@@ -2,25 +2,37 @@
 
 from __future__ import annotations
 
-from typing import Any
+from abc import ABC, abstractmethod
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from ast_sim.batches.batch_builder import Batch, Target
+from ast_sim.batches.mirror_and_shift import Placement
 from ast_sim.batches.pairs import Jump, Pair, PairSampler
 
 
-class TrainingPool:
+class PooledScene(Protocol):
+    """A scene of a pool: a trajectory by its number, mirrored and moved."""
+
+    index: int
+    placement: Placement
+
+
+S = TypeVar("S", bound=PooledScene)
+
+
+class TrainingPool(ABC, Generic[S]):
     """Training scenes that go on from the model's own answers. The pool has `size` places, and batches take them in
     turn.
 
     When a scene ends, another follows at its place; all are drawn about equally often. The seed determines all random
     choices. `batch` may be called ahead of `advance` if the two calls concern different places.
 
-    A derived class says how a scene starts, what of it a batch holds, and how it goes on. Its scenes have an `index`, a
-    `placement`, and the attributes in `kept`.
+    A derived class says how a scene starts, what of it a batch holds, and how it goes on. Its scenes also have the
+    attributes in `kept`.
 
     Args:
         sampler: reads and assembles frames. Its batch size, seed and part hold for the pool too.
@@ -36,19 +48,19 @@ class TrainingPool:
         self._sampler, self._size, self._batches = sampler, size, size // sampler.batch_size
         self._largest = largest
         self._begun: dict[int, int] = {}
-        self._going: dict[int, Any] = {}
+        self._going: dict[int, S] = {}
 
-    def _start(self, index: int, first: bool, generator: np.random.Generator) -> Any:
+    @abstractmethod
+    def _start(self, index: int, first: bool, generator: np.random.Generator) -> S:
         """A scene at its start; `first`: the first one at its place."""
-        raise NotImplementedError
 
-    def _frames(self, place: int, scene: Any) -> Pair | Jump:
-        """What a batch holds of a scene: the scene itself, unless a derived class says otherwise."""
-        return scene
+    @abstractmethod
+    def _frames(self, place: int, scene: S) -> Pair | Jump:
+        """What a batch holds of a scene."""
 
-    def _goes_on(self, scene: Any, error: np.ndarray) -> bool:
+    @abstractmethod
+    def _goes_on(self, scene: S, error: np.ndarray) -> bool:
         """Take over the answer, which is off its target by `error` [N, 3]; False: the scene ends."""
-        raise NotImplementedError
 
     def batch(self, number: int) -> tuple[Batch, Target]:
         """The present states of the scenes of a batch, and what the model should make of them."""
@@ -104,7 +116,7 @@ class TrainingPool:
         scenes = (self._going[place] for place in self._places(number))
         return values.split([self._sampler.num_nodes(scene.index) for scene in scenes])
 
-    def _drawn(self, place: int) -> Any:
+    def _drawn(self, place: int) -> S:
         """The last scene that started at a place, as it was at the start."""
         sampler, begun = self._sampler, self._begun[place]
         order, draws = self.streams

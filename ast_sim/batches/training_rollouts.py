@@ -42,7 +42,7 @@ class _Rolling:
     pair: Pair | None = None
 
 
-class RolloutPool(TrainingPool):
+class RolloutPool(TrainingPool[_Rolling]):
     """Training scenes that are rolled out side by side; see `TrainingPool` for the arguments.
 
     A scene starts at its first frame, and another scene follows it after its last frame. Only the first scene at each
@@ -67,19 +67,21 @@ class RolloutPool(TrainingPool):
         white = self._sampler.white_noise(scene.index, generator)
         error, after = white, self._sampler.left * white
         if scene.error is not None:
-            error, after = scene.error + white * SHARE, after * SHARE + self._led_back(scene)
+            led_back = self._led_back(scene.error, scene.error_before)
+            error, after = scene.error + white * SHARE, after * SHARE + led_back
         scene.pair = Pair(scene.index, scene.t, scene.placement, error, scene.error_before, after)
         return scene.pair
 
-    def _led_back(self, scene: _Rolling) -> np.ndarray:
+    def _led_back(self, error: np.ndarray, error_before: np.ndarray | None) -> np.ndarray:
         """How much of the error that the last step left in p_t the target leaves in p_{t+1}."""
         left = self._sampler.left
         if not self._sampler.scheme.has_inertia:
-            return left * scene.error
-        before = np.float32(0) if scene.error_before is None else scene.error_before
-        return 2 * left * scene.error - left**2 * before
+            return left * error
+        before = np.float32(0) if error_before is None else error_before
+        return 2 * left * error - left**2 * before
 
     def _goes_on(self, scene: _Rolling, error: np.ndarray) -> bool:
+        assert scene.pair is not None  # `batch` has made it
         scene.t += 1
         error = error + scene.pair.error_after  # the residual counts from the target, which has an error of its own
         before = scene.pair.error if self._sampler.scheme.has_inertia else None

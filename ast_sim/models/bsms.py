@@ -90,10 +90,10 @@ class BSMS(WorldEdgeSimulator):
     def graph(self, scene: Scene) -> Graph:
         """See `Simulator`. `own` is the hierarchy of meshes."""
         graph = super().graph(scene)
-        edges, prescribed = graph.m2m, graph.prescribed
+        edges, prescribed = graph.edges, graph.prescribed
         if not self.config.prescribed_edges:
             edges = subset(edges, ~(prescribed[edges.senders] & prescribed[edges.receivers]))
-        own = build_hierarchy(edges, graph.rest_position, self.config.levels, pooled=True, mesh=graph.m2m)
+        own = build_hierarchy(edges, graph.rest_position, self.config.levels, pooled=True, mesh=graph.edges)
         return replace(graph, own=own)
 
     def world(self, batch: Batch) -> EdgeSet:

@@ -95,7 +95,7 @@ class HCMT(WorldEdgeSimulator):
     def graph(self, scene: Scene) -> Graph:
         """See `Simulator`. `own` is the hierarchy of meshes."""
         graph = super().graph(scene)
-        own = build_hierarchy(graph.m2m, graph.rest_position, self.config.levels, pooled=False, mesh=graph.m2m)
+        own = build_hierarchy(graph.edges, graph.rest_position, self.config.levels, pooled=False, mesh=graph.edges)
         return replace(graph, own=own)
 
     def world(self, batch: Batch) -> EdgeSet:

@@ -30,6 +30,7 @@ from ast_sim.models.node_inputs import node_features, normalizer_of
 from ast_sim.models.normalizer import FeatureNormalizer, Normalizer
 from ast_sim.models.registry import Model
 from ast_sim.models.simulator import Latent, Prediction, Simulator, Use
+from ast_sim.ops import mesh_edges
 from ast_sim.scene import Scene
 
 EPSILON = 1e-5  # added to the weight of a slice, so that an empty one is 0
@@ -155,7 +156,8 @@ class Transolver(Simulator):
 
     def graph(self, scene: Scene) -> Graph:
         """See `Simulator`. It has no edges."""
-        return replace(super().graph(scene), m2m=None, rest_edges=torch.empty(0, 4, dtype=torch.float32))
+        no_edges = mesh_edges(torch.empty(0, 2, dtype=torch.int64), scene.num_nodes)
+        return replace(super().graph(scene), edges=no_edges, rest_edges=torch.empty(0, 4, dtype=torch.float32))
 
     def inputs_of(self, batch: Batch, use: Use = Normalizer.__call__) -> tuple[Tensor, Tensor]:
         """See `Simulator`: of the nodes, and their positions at rest and now from the centre of the domain, [N, 6]."""

@@ -90,7 +90,7 @@ class WorldEdgeSimulator(Simulator):
     def inputs_of(self, batch: Batch, use: Use = Normalizer.__call__) -> tuple[Tensor, list[Edges], list[Edges]]:
         """See `Simulator`: of the nodes, and the mesh edges and world edges of each mesh, the finest first."""
         graph, now = batch.graph, batch.position
-        meshes = [(graph.m2m, graph.rest_edges, now)] if graph.own is None else graph.own.meshes(now)
+        meshes = [(graph.edges, graph.rest_edges, now)] if graph.own is None else graph.own.meshes(now)
         on_mesh, on_world = [], []
         for level, (edges, rest, position) in enumerate(meshes):
             features = edge_features(self.config, edges, rest, position, position)

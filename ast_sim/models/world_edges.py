@@ -19,7 +19,7 @@ def world_edges(batch: Batch, radius: float, most: int | None) -> EdgeSet:
     scenes.
 
     Args:
-        batch: its positions, and the mesh edges `m2m` of its graph.
+        batch: its positions, and the mesh edges of its graph.
         radius: in the unit of length; 0 gives no edges.
         most: the most pairs of a scene. The shortest pairs are kept; of equally long pairs, the pairs with the lowest
             node numbers. A warning says so once. None keeps all.
@@ -28,7 +28,7 @@ def world_edges(batch: Batch, radius: float, most: int | None) -> EdgeSet:
     offsets = graph.node_offsets.tolist()
     position = batch.position.detach().double().numpy()
     # Mesh edges lie in both directions, sorted by receiver and sender.
-    mesh = _keys(graph.m2m.receivers.numpy(), graph.m2m.senders.numpy(), len(position))
+    mesh = _keys(graph.edges.receivers.numpy(), graph.edges.senders.numpy(), len(position))
     near = [start + _pairs(position[start:end], radius) for start, end in zip(offsets[:-1], offsets[1:], strict=True)]
     kept = [_shortest(_without(pairs, mesh, len(position)), position, most) for pairs in near]
     pairs = np.concatenate(kept) if kept else np.zeros((0, 2), np.int64)

@@ -21,17 +21,16 @@ def test_node_edges_of_two_tetrahedra():
     graph = Graph.from_scene(two_tetrahedra(), element_nodes=False)
     # Nodes 0 and 4 are the two tips, joined to the shared face 1, 2, 3 only; by receiver, then sender.
     neighbours = {0: [1, 2, 3], 1: [0, 2, 3, 4], 2: [0, 1, 3, 4], 3: [0, 1, 2, 4], 4: [1, 2, 3]}
-    assert pairs(graph.m2m) == [(s, r) for r, senders in neighbours.items() for s in senders]
-    assert graph.m2m.receiver_offsets.tolist() == [0, 3, 7, 11, 15, 18]
-    assert graph.e2m is None and graph.m2e is None
+    assert pairs(graph.edges) == [(s, r) for r, senders in neighbours.items() for s in senders]
+    assert graph.edges.receiver_offsets.tolist() == [0, 3, 7, 11, 15, 18]
+    assert graph.m2e is None
 
 
 def test_element_edges_of_two_tetrahedra():
     graph = Graph.from_scene(two_tetrahedra(), element_nodes=True)
-    assert pairs(graph.e2m) == [(0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (0, 3), (1, 3), (1, 4)]
+    assert pairs(graph.edges) == [(0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (0, 3), (1, 3), (1, 4)]
     assert pairs(graph.m2e) == [(0, 0), (1, 0), (2, 0), (3, 0), (1, 1), (2, 1), (3, 1), (4, 1)]
     assert graph.m2e.receiver_offsets.tolist() == [0, 4, 8]
-    assert graph.m2m is None
 
 
 def test_masks_and_element_means():
@@ -65,13 +64,15 @@ def test_a_batch_is_its_scenes_with_shifted_numbers():
             shifted = [
                 (s + a, r + b)
                 for graph, a, b in zip(graphs, [0, 6, 8], [0, 8, 13], strict=True)
-                for s, r in pairs(graph.e2m)
+                for s, r in pairs(graph.edges)
             ]
-            assert pairs(batch.e2m) == shifted
+            assert pairs(batch.edges) == shifted
             assert batch.m2e.num_senders == 21 and batch.m2e.num_receivers == 14
         else:
-            shifted = [(s + a, r + a) for graph, a in zip(graphs, [0, 8, 13], strict=True) for s, r in pairs(graph.m2m)]
-            assert pairs(batch.m2m) == shifted
+            shifted = [
+                (s + a, r + a) for graph, a in zip(graphs, [0, 8, 13], strict=True) for s, r in pairs(graph.edges)
+            ]
+            assert pairs(batch.edges) == shifted
 
 
 def test_batches_of_batches_are_batches():

@@ -370,7 +370,7 @@ def test_members_that_were_not_used_for_longest_are_let_go(dataset, monkeypatch)
         again, reached = tight.batch(step)
         assert again.names == batch.names and tight._members.held < plenty._members.held
         assert torch.equal(again.position, batch.position) and torch.equal(reached.motion, target.motion)
-        assert torch.equal(again.graph.m2m.senders, batch.graph.m2m.senders)
+        assert torch.equal(again.graph.edges.senders, batch.graph.edges.senders)
 
 
 def test_a_split_without_pairs_is_an_error(tmp_path):

@@ -127,8 +127,8 @@ def meshes() -> tuple[Graph, Graph]:
 def test_a_mesh_against_the_dense_formulas(pooled):
     """Depth classes, (A + I)^2, the weights and rest edges of each level, all by dense matrices in float64."""
     graph, _ = meshes()
-    found = build_hierarchy(graph.m2m, graph.rest_position, 3, pooled, graph.m2m)
-    a, w, position = dense(graph.m2m), np.ones(len(graph.rest_position)), graph.rest_position.double().numpy()
+    found = build_hierarchy(graph.edges, graph.rest_position, 3, pooled, graph.edges)
+    a, w, position = dense(graph.edges), np.ones(len(graph.rest_position)), graph.rest_position.double().numpy()
     for pooling, edges, rest in zip(found.poolings, found.edges[1:], found.rest_edges[1:], strict=True):
         kept = pooling.kept.numpy()
         assert (np.diff(kept) > 0).all() and len(kept) <= (len(a) + 1) // 2 + (a.sum(0) == 0).sum()
@@ -148,9 +148,9 @@ def test_a_mesh_against_the_dense_formulas(pooled):
 def test_one_class_of_depths_is_kept_in_every_component():
     """By a search of our own from each possible start: the kept nodes are all nodes of one parity from some start."""
     graph, _ = meshes()
-    a = dense(graph.m2m).astype(int)
+    a = dense(graph.edges).astype(int)
     kept = set(select(csr_array(a.astype(bool)), graph.rest_position.double().numpy()).tolist())
-    component = build_hierarchy(graph.m2m, graph.rest_position, 1, True, graph.m2m).component.numpy()
+    component = build_hierarchy(graph.edges, graph.rest_position, 1, True, graph.edges).component.numpy()
     for label in set(component):
         members = set(np.flatnonzero(component == label).tolist())
         classes = []
@@ -168,7 +168,7 @@ def test_one_class_of_depths_is_kept_in_every_component():
 
 def test_contacts_are_pooled_by_the_dense_formula():
     graph, _ = meshes()
-    found = build_hierarchy(graph.m2m, graph.rest_position, 3, True, graph.m2m)
+    found = build_hierarchy(graph.edges, graph.rest_position, 3, True, graph.edges)
     generator = torch.Generator().manual_seed(0)
     n = len(graph.rest_position)
     contacts = edge_set(torch.randint(0, n, (6, 2), generator=generator).tolist(), n)
@@ -186,7 +186,7 @@ def test_contacts_are_pooled_by_the_dense_formula():
 
 
 def test_a_batch_is_the_concatenation_of_its_scenes():
-    one, other = (build_hierarchy(g.m2m, g.rest_position, 2, True, g.m2m) for g in meshes())
+    one, other = (build_hierarchy(g.edges, g.rest_position, 2, True, g.edges) for g in meshes())
     both = Hierarchy.concatenate([one, other])
     shift = 0
     for level, pooling in enumerate(both.poolings):
@@ -207,7 +207,7 @@ def test_a_batch_is_the_concatenation_of_its_scenes():
 
 def test_it_is_the_same_every_time():
     graph, _ = meshes()
-    first, second = (build_hierarchy(graph.m2m, graph.rest_position, 4, True, graph.m2m) for _ in range(2))
+    first, second = (build_hierarchy(graph.edges, graph.rest_position, 4, True, graph.edges) for _ in range(2))
     for a, b in zip(first.poolings, second.poolings, strict=True):
         assert torch.equal(a.kept, b.kept) and torch.equal(a.weight, b.weight)
     for a, b in zip(first.edges, second.edges, strict=True):
@@ -219,8 +219,8 @@ def test_the_hierarchy_of_a_mirror_image_has_mirrored_edges(pooled):
     graph = meshes()[0]
     mirror = Placement(np.float32([-1, 1, -1]), np.float32([0.25, 0, 0.5]), np.zeros(3, np.float32))
     there = mirror.points(graph.rest_position)
-    found = build_hierarchy(graph.m2m, graph.rest_position, 2, pooled, graph.m2m).placed(mirror)
-    expected = build_hierarchy(graph.m2m, there, 2, pooled, graph.m2m)
+    found = build_hierarchy(graph.edges, graph.rest_position, 2, pooled, graph.edges).placed(mirror)
+    expected = build_hierarchy(graph.edges, there, 2, pooled, graph.edges)
     for level in range(3):
         assert torch.equal(found.edges[level].senders, expected.edges[level].senders)
         torch.testing.assert_close(found.rest_edges[level], expected.rest_edges[level], rtol=0, atol=1e-6)
@@ -229,7 +229,7 @@ def test_the_hierarchy_of_a_mirror_image_has_mirrored_edges(pooled):
 
 def test_pooling_and_unpooling_are_the_gradients_of_each_other():
     graph, _ = meshes()
-    pooling = build_hierarchy(graph.m2m, graph.rest_position, 1, True, graph.m2m).poolings[0]
+    pooling = build_hierarchy(graph.edges, graph.rest_position, 1, True, graph.edges).poolings[0]
     fine, coarse = torch.randn(pooling.edges.num_senders, 2), torch.randn(len(pooling.kept), 2)
     for op, adjoint, x, y in (
         (pooling.pool, pooling.unpool, fine, coarse),

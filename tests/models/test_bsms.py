@@ -120,8 +120,8 @@ def test_contacts_of_components_join_no_component_with_itself():
 def test_edges_between_prescribed_nodes_can_be_left_out():
     model, batch = made(replace(resolved(SMALL), prescribed_edges=False), 0)
     edges, graph = batch.graph.own.edges[0], batch.graph
-    both = graph.prescribed[graph.m2m.senders] & graph.prescribed[graph.m2m.receivers]
-    assert len(edges) == len(graph.m2m) - int(both.sum()) < len(graph.m2m)
+    both = graph.prescribed[graph.edges.senders] & graph.prescribed[graph.edges.receivers]
+    assert len(edges) == len(graph.edges) - int(both.sum()) < len(graph.edges)
     assert not (graph.prescribed[edges.senders] & graph.prescribed[edges.receivers]).any()
     kept = batch.graph.own.poolings[0].kept  # the nodes of the block are left without neighbours, and stay
     assert set((graph.node_type == NodeType.OBSTACLE).nonzero()[:, 0].tolist()) <= set(kept.tolist())

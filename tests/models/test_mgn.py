@@ -22,7 +22,7 @@ def formulas(model, batch):
         def normal(name, x):
             return (x.to(dtype) - p[f"{name}.mean"]) / p[f"{name}.scale"]
 
-        mesh, world, position, rest = batch.graph.m2m, model.world(batch), batch.position, batch.graph.rest_edges
+        mesh, world, position, rest = batch.graph.edges, model.world(batch), batch.position, batch.graph.rest_edges
         vectors = edge_vectors(mesh, position, position)
         on_mesh = torch.cat([rest, vectors - rest if model.config.edge_strain else vectors], dim=1)
         v = deep_mlp(p, "node_encoder", normal("node_inputs", node_features(model.config, batch)))

@@ -270,7 +270,7 @@ def test_the_order_of_the_nodes_does_not_matter():
 
 def test_it_knows_no_edges():
     graph = model_of(small()).graph(scene(0))
-    assert graph.m2m is None and graph.e2m is None and len(graph.rest_edges) == 0
+    assert len(graph.edges) == len(graph.rest_edges) == 0
 
 
 def test_number_of_parameters_of_the_original():

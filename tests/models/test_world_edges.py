@@ -37,7 +37,7 @@ def pairs_of(edges) -> set[tuple[int, int]]:
 
 def all_pairs(batch: Batch, radius: float) -> set[tuple[int, int]]:
     """By the definition: every ordered pair of a scene, measured in float64."""
-    mesh, position, found = pairs_of(batch.graph.m2m), batch.position.double(), set()
+    mesh, position, found = pairs_of(batch.graph.edges), batch.position.double(), set()
     for start, end in zip(batch.graph.node_offsets[:-1].tolist(), batch.graph.node_offsets[1:].tolist(), strict=True):
         for i in range(start, end):
             for j in range(start, end):
