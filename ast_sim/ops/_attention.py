@@ -45,7 +45,7 @@ def _threefry(rounds: int, key: list[Tensor], x: list[Tensor]) -> list[Tensor]:
     return x
 
 
-def dropout_factors(p: float, seed: int, scene: int, shape: tuple[int, int, int], like: Tensor) -> Tensor:
+def dropout_factors(p: float, seed: int, scene: int, shape: Sequence[int], like: Tensor) -> Tensor:
     """[H, Tq, Tk]: the factors by which dropout multiplies the weights of a scene, 0 or 1 / (share kept).
 
     They depend on seed, scene, head, query and key alone. Each weight gets 16 random bits and is dropped if these lie
@@ -98,7 +98,7 @@ def _join(like: Tensor, fill: float, parts: list[tuple[slice, Tensor]]) -> Tenso
 
 
 def _factors(scores: Tensor, dropout_p: float, seed: int, scene: int) -> Tensor | float:
-    return dropout_factors(dropout_p, seed, scene, tuple(scores.shape), scores) if dropout_p else 1.0
+    return dropout_factors(dropout_p, seed, scene, scores.shape, scores) if dropout_p else 1.0
 
 
 def _reference(q, k, v, q_offsets, k_offsets, scale, dropout_p, seed):

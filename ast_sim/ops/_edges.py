@@ -123,7 +123,7 @@ class EdgeSet(IndexSet):
         return len(self.receiver_offsets) - 1
 
     @_kept
-    def by_receiver(self) -> tuple[Tensor, Tensor]:
+    def by_receiver(self) -> tuple[Tensor, ...]:
         """The edges in stored order, and the offsets of each receiver's edges, as segment ops take them."""
         return *frozen(torch.arange(len(self), device=self.receivers.device)), self.receiver_offsets
 

@@ -74,14 +74,16 @@ def _check_features(edges: EdgeSet, of_senders: Tensor, edge_features: Tensor | 
         raise ValueError(f"message: edge_features without an encoder must have shape {wanted}, not {shape}")
 
 
-def _of_edges(edges: EdgeSet, of_senders: Tensor, edge_features: Tensor | None, encoder: Encoder | None) -> tuple:
+def _of_edges(
+    edges: EdgeSet, of_senders: Tensor, edge_features: Tensor | None, encoder: Encoder | None
+) -> tuple[Tensor, ...]:
     """The edge features and the encoder as the op takes them: empty where there are none."""
     if edge_features is None:
         edge_features = of_senders.new_empty(len(edges), 0)
-    if encoder is None:
-        shapes = ((0, edge_features.shape[1]), (0,), (of_senders.shape[-1], 0))
-        encoder = tuple(of_senders.new_empty(shape) for shape in shapes)
-    return edge_features, *encoder
+    if encoder is not None:
+        return edge_features, *encoder
+    shapes = ((0, edge_features.shape[1]), (0,), (of_senders.shape[-1], 0))
+    return edge_features, *(of_senders.new_empty(shape) for shape in shapes)
 
 
 def _call(edges: EdgeSet, of_senders, of_receivers, edge_features, encoder, W2, b2, gamma, beta, with_messages: bool):

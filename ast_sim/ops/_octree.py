@@ -15,8 +15,6 @@ from torch import Tensor
 from ast_sim.ops.library import IndexSet, Kernel, Op
 from ast_sim.ops.spec import Given, Sizes, segment_of
 
-MAX_DEPTH = 21
-
 
 @dataclass(frozen=True)
 class Octree(IndexSet):
@@ -260,4 +258,4 @@ def octree(positions: Tensor, offsets: Tensor, center: Sequence[float], half_wid
     """
     if len(center) != 3:
         raise ValueError(f"octree: center must be three numbers, not {len(center)}")
-    return Octree(*_octree(positions, offsets, *map(float, center), float(half_width), depth), depth)
+    return Octree(*_octree(positions, offsets, *map(float, center), float(half_width), depth), depth=depth)

@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch._C._functorch import is_legacy_batchedtensor
 
 from ast_sim.ops.library import LIBRARY, Kernel, Op
 from ast_sim.ops.spec import Argument
@@ -154,15 +155,15 @@ def differentiate(op: Op, setup_context: Callable, backward: Callable) -> None:
 
 def _is_old_batch(x: Tensor | None) -> bool:
     """Whether x is batched by `is_grads_batched=True`, whose vmap is older than torch.func and knows few ops."""
-    return x is not None and torch._C._functorch.is_legacy_batchedtensor(x)
+    return x is not None and is_legacy_batchedtensor(x)
 
 
 def _backward_of_each(backward: Callable, ctx, gradients: tuple) -> tuple:
     """`backward`, one sample after the other."""
     level = torch._C._vmapmode_increment_nesting() - 1
     torch._C._vmapmode_decrement_nesting()
-    batches = [torch._remove_batch_dim(x, level, 0, 0) if _is_old_batch(x) else x for x in gradients]
+    batches = [torch.ops.aten._remove_batch_dim(x, level, 0, 0) if _is_old_batch(x) else x for x in gradients]
     num = next(len(x) for x, y in zip(batches, gradients, strict=True) if _is_old_batch(y))
     samples = [[x[i] if _is_old_batch(y) else x for x, y in zip(batches, gradients, strict=True)] for i in range(num)]
     parts = zip(*(backward(ctx, *sample) for sample in samples), strict=True)
-    return tuple(None if x[0] is None else torch._add_batch_dim(torch.stack(x), 0, level) for x in parts)
+    return tuple(None if x[0] is None else torch.ops.aten._add_batch_dim(torch.stack(x), 0, level) for x in parts)

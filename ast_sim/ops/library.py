@@ -18,11 +18,12 @@ import warnings
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch._C._functorch import get_unwrapped, is_batchedtensor, is_functorch_wrapped_tensor
 from torch.autograd import forward_ad
 from torch.fx.experimental.proxy_tensor import disable_proxy_modes_tracing
 
@@ -51,7 +52,7 @@ def _share_torch_threads() -> None:
     _C.set_pool(*(ctypes.cast(function, ctypes.c_void_p).value for function in pool))
 
 
-if BACKEND == "c":
+if TYPE_CHECKING or BACKEND == "c":
     from ast_sim import _C
 
     _share_torch_threads()
@@ -127,7 +128,7 @@ class Kernel:
             raise self._reason(self.spec.inputs, arguments) or error from None
         self(*given)
         outputs = given[self._num :]
-        return outputs if len(outputs) > 1 else outputs[0]
+        return outputs[0] if len(outputs) == 1 else outputs
 
     def run(self, *arguments) -> Any:
         """The op: what the C core computes, as an op returns it."""
@@ -140,7 +141,7 @@ class Kernel:
         return list(outputs) if self.spec.counts else self.given(outputs, arguments)
 
     @staticmethod
-    def given(outputs: tuple, arguments: tuple) -> Any:
+    def given(outputs: Sequence[Tensor | None], arguments: Sequence[Any]) -> Any:
         """The outputs as an op returns them: one that is not wanted is empty, because an op cannot return None."""
         if len(outputs) == 1:
             return outputs[0]
@@ -250,16 +251,15 @@ def _has_tangent(x) -> bool:
 
 def is_differentiated(x: torch.Tensor) -> bool:
     """Whether x has a gradient or a tangent, or belongs to a transform of torch.func."""
-    return x.requires_grad or _has_tangent(x) or torch._C._functorch.is_functorch_wrapped_tensor(x)
+    return x.requires_grad or _has_tangent(x) or is_functorch_wrapped_tensor(x)
 
 
 def _is_batched(x) -> bool:
     """Whether x is another tensor for each sample of a vmap."""
-    functorch = torch._C._functorch
-    while isinstance(x, torch.Tensor) and functorch.is_functorch_wrapped_tensor(x):
-        if functorch.is_batchedtensor(x):
+    while isinstance(x, torch.Tensor) and is_functorch_wrapped_tensor(x):
+        if is_batchedtensor(x):
             return True
-        x = functorch.get_unwrapped(x)
+        x = get_unwrapped(x)
     return False
 
 
