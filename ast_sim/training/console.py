@@ -18,7 +18,7 @@ from ast_sim.support.progress import Clock, Progress, ShowProgress
 from ast_sim.support.stop_signals import StopSignals
 from ast_sim.training.callbacks import Listener
 from ast_sim.training.data_lengths import DataScales
-from ast_sim.training.rates import learning_rate
+from ast_sim.training.rates import Schedule
 
 # The output counts as constant if its standard deviation over the nodes, relative to the targets', is below this.
 CONSTANT = 1e-3
@@ -28,16 +28,17 @@ def introduction(model: Simulator, config: RunConfig, dataset: Dataset, scales: 
     """Lines with the sizes of the model and the data, the number of steps, and the noise relative to lengths of the
     data."""
     options, unit = config.train, dataset.info.length_unit
+    steps = Schedule.of(options).steps
+    noise = options.noise or 0.0
     scenes = options.batch_size * options.accumulate
-    epochs = options.steps * scenes / pairs
+    epochs = steps * scenes / pairs
     rms, spacing = max(scales.increment, 1e-300), max(scales.spacing, 1e-300)
     used = f"{scales.trajectories:,}" if options.scenes is None else f"{options.scenes:,} of {scales.trajectories:,}"
     return [
         f"parameters  {model.num_parameters:,}",
         f"data        {used} scenes of about {scales.nodes:,} nodes, {pairs:,} pairs",
-        f"steps       {options.steps:,} of {scenes} scenes each: {epochs:.3g} epochs",
-        f"noise       {options.noise:.3g} {unit} = {options.noise / rms:.2g} x rms increment"
-        f" = {options.noise / spacing:.2g} x mesh spacing",
+        f"steps       {steps:,} of {scenes} scenes each: {epochs:.3g} epochs",
+        f"noise       {noise:.3g} {unit} = {noise / rms:.2g} x rms increment = {noise / spacing:.2g} x mesh spacing",
         *(f"{what.lower():12}{fact}" for what, fact in config.model.facts(unit, spacing).items()),
     ]
 
@@ -110,8 +111,10 @@ class StepLog:
         sums: sums of the values of all steps since the last line; a checkpoint keeps them.
     """
 
-    def __init__(self, metrics: Metrics, config: RunConfig, dataset: Dataset, clock: Clock, listener: Listener) -> None:
-        self.metrics, self.options, self.clock = metrics, config.train, clock
+    def __init__(
+        self, metrics: Metrics, schedule: Schedule, dataset: Dataset, clock: Clock, listener: Listener
+    ) -> None:
+        self.metrics, self.schedule, self.clock = metrics, schedule, clock
         self.listener = listener
         self.validates = dataset.count("valid") > 0
         self.sums: dict[str, float] = {}
@@ -128,15 +131,14 @@ class StepLog:
         self.sums = {}
         seconds = self.clock.seconds_per_step
         if writes:
-            rate = learning_rate(self.options, step - 1)
-            record = {**means, "rate": rate, "seconds": seconds}
+            record = {**means, "rate": self.schedule.rate(step - 1), "seconds": seconds}
             self.metrics.append({"step": step, **record})
             self.listener.hear(step, record)
         shown = {key.removeprefix(FIELD): mean for key, mean in means.items() if key == STRESS or key.startswith(FIELD)}
         fields = "".join(f", {name} {mean:.4f}" for name, mean in shown.items())
-        to_go = self.clock.to_go(self.options.steps - step, self._validations_to_go(step))
+        to_go = self.clock.to_go(self.schedule.steps - step, self._validations_to_go(step))
         progress.show(
-            f"step {step:,}/{self.options.steps:,}: loss {means['loss']:.4f}, motion {means['motion']:.4f}"
+            f"step {step:,}/{self.schedule.steps:,}: loss {means['loss']:.4f}, motion {means['motion']:.4f}"
             f"{fields}, {1000 * seconds:.1f} ms a step, {to_go} to go"
         )
         if means["spread"] < CONSTANT:
@@ -148,5 +150,5 @@ class StepLog:
             )
 
     def _validations_to_go(self, step: int) -> int:
-        every = self.options.validate_every
-        return math.ceil(self.options.steps / every) - (step - 1) // every if self.validates else 0
+        every = self.schedule.validate_every
+        return math.ceil(self.schedule.steps / every) - (step - 1) // every if self.validates else 0

@@ -15,6 +15,7 @@ from ast_sim.runs.train_config import RunConfig, TrainConfig
 from ast_sim.support.errors import ConfigError
 from ast_sim.support.toml_settings import LARGEST, require_range
 from ast_sim.training.data_lengths import DataScales
+from ast_sim.training.rates import Schedule
 
 # An unset shift is at most this share of the domain's half width; the margin of `Domain` is larger.
 LARGEST_SHIFT = 0.05
@@ -129,8 +130,9 @@ def resolve_training(config: TrainConfig, scales: DataScales, model: ModelConfig
     )
     if resolved.corrections and not model.scheme.corrects:
         raise ConfigError(f"train.corrections is {resolved.corrections}; without model.jumps it must be 0")
-    if resolved.decay <= resolved.warmup:
-        raise ConfigError(f"train.warmup is {resolved.warmup}; it must be below train.decay = {resolved.decay}")
+    schedule = Schedule.of(resolved)
+    if schedule.decay <= schedule.warmup:
+        raise ConfigError(f"train.warmup is {schedule.warmup}; it must be below train.decay = {schedule.decay}")
     return resolved
 
 

@@ -37,7 +37,7 @@ from ast_sim.training.data_lengths import DataScales, largest_error
 from ast_sim.training.optimizer import Optimizer
 from ast_sim.training.parallel.processes import Processes
 from ast_sim.training.profile import profile, table
-from ast_sim.training.rates import learning_rate, step_seed
+from ast_sim.training.rates import Schedule, step_seed
 from ast_sim.training.resuming import Saver
 from ast_sim.training.validation import Validated, error_share, validate, verdict
 
@@ -87,6 +87,7 @@ class Training:
     ) -> None:
         self.run, self.config, self.dataset, self.scales, self.signals = run, config, dataset, scales, signals
         self.options, self.processes = config.train, processes or Processes()
+        self.schedule = Schedule.of(config.train)
         torch.manual_seed(self.options.seed)
         self.model = build_model(config.model)
         part = self.processes.rank, self.processes.count
@@ -96,8 +97,8 @@ class Training:
         self.optimizer = Optimizer(self.model, self.options.optimizer)
         self.clock = Clock()
         self.listener = Listener(callback)
-        self.log = StepLog(run.metrics, config, dataset, self.clock, self.listener)
-        self.progress = Console(self.options.steps, signals, progress)
+        self.log = StepLog(run.metrics, self.schedule, dataset, self.clock, self.listener)
+        self.progress = Console(self.schedule.steps, signals, progress)
         self.saver = Saver(run, dataset, self.model, self.optimizer, self.pool, self.processes, self.progress.line)
         self.step = 0
         self.stopping = 0  # the number of a signal that some process has received; 0: no signal
@@ -143,27 +144,27 @@ class Training:
 
     def go(self) -> None:
         """Train from the newest checkpoint, or from the beginning, to the last step."""
-        options = self.options
+        schedule = self.schedule
         self._introduce()
         self.prepare()
         with self.progress.begin(self.step):
             validated = self.processes.of_leader(self.log.metrics.validation(self.step) is not None)
-            if self.step and self._due(options.validate_every) and not validated:
+            if self.step and self._due(schedule.validate_every) and not validated:
                 self._validate()
                 self._heed_callback()
                 self._stop_if_requested()
             self.clock.restart()
-            while self.step < options.steps:
+            while self.step < schedule.steps:
                 self.advance()
                 self.progress.advance()
-                if self._due(options.log_every):
+                if self._due(self.options.log_every):
                     self.log.show(self.step, self.progress, self.processes.leads)
-                validates = self._due(options.validate_every)
+                validates = self._due(schedule.validate_every)
                 self._heed_signals()
                 self._heed_callback()
-                if validates or self._due(options.checkpoint_every) or self.stopping:
+                if validates or self._due(schedule.checkpoint_every) or self.stopping:
                     self.ahead.wait()
-                    self.saver.save(self.step, self.log.sums, options.keep)
+                    self.saver.save(self.step, self.log.sums, self.options.keep)
                 self._stop_if_requested()
                 self.clock.step()
                 if validates:
@@ -176,7 +177,7 @@ class Training:
             self.progress.line(line)
 
     def _due(self, every: int) -> bool:
-        return self.step % every == 0 or self.step == self.options.steps
+        return self.step % every == 0 or self.step == self.schedule.steps
 
     def _heed_signals(self) -> None:
         if self.processes.any(self.signals.received is not None):
@@ -219,7 +220,7 @@ class Training:
         norm = self.optimizer.clip(options.clip)
         if not math.isfinite(norm):
             raise self._not_finite("norm of the gradient", norm, names)
-        self.optimizer.step(learning_rate(options, self.step))
+        self.optimizer.step(self.schedule.rate(self.step))
         self.step += 1
         self.log.add({**values, "grad_norm": norm, "clipped_share": float(norm > options.clip)})
 
@@ -234,7 +235,13 @@ class Training:
             weights = self.pool.weights(number, self.processes.gathered(self.pool.errors(number, target)))
         options = self.options
         losses = self.model.loss(
-            prediction, batch, target, options.stress_weight, self.processes.share, weights, options.strain_weight
+            prediction,
+            batch,
+            target,
+            options.stress_weight,
+            self.processes.share,
+            weights,
+            options.strain_weight or 0.0,
         )
         added = self.processes.add(torch.stack([value.detach() for value in losses.values()]))
         whole = dict(zip(losses, added.tolist(), strict=True))
@@ -251,7 +258,7 @@ class Training:
         kept = f"the last good checkpoint is {last}" if last else "there is no checkpoint yet"
         return TrainingError(
             f"the {what} of step {self.step + 1} is {value}, so training stopped before this step: check the samples"
-            f" {', '.join(names)}, or start again with a train.peak_rate below {self.options.peak_rate:.3g}; {kept}"
+            f" {', '.join(names)}, or start again with a train.peak_rate below {self.schedule.peak_rate:.3g}; {kept}"
         )
 
     def validated(self, split: str) -> list[Validated]:

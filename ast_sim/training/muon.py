@@ -34,7 +34,7 @@ class Muon:
         shapes: rows and columns of each matrix, in order.
     """
 
-    def __init__(self, values: Tensor, gradients: Tensor, shapes: Sequence[tuple[int, int]]) -> None:
+    def __init__(self, values: Tensor, gradients: Tensor, shapes: Sequence[tuple[int, ...]]) -> None:
         self.values = values
         self.gradients = gradients
         self.momentum = torch.zeros_like(values)

@@ -42,7 +42,7 @@ class Optimizer:
         self._adam = torch.optim.AdamW([self._rest], lr=0.0, weight_decay=0.0, fused=True)
         self._muon = None
         if matrices:
-            self._muon = Muon(values[rest:], self.gradient[rest:], [tuple(p.shape) for p in matrices])
+            self._muon = Muon(values[rest:], self.gradient[rest:], [p.shape for p in matrices])
 
     def zero_gradient(self) -> None:
         self.gradient.zero_()

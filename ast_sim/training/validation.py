@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,7 +33,8 @@ EFFORT_SCENES = 10  # validation scenes, at most, on which the default effort is
 JUMPS = 4  # frames of a scene at which a model that jumps is validated, evenly spread, the last one included
 
 
-class Validated(NamedTuple):
+@dataclass(frozen=True)
+class Validated:
     """The errors of one validation scene.
 
     Attributes:

@@ -31,7 +31,7 @@ from ast_sim.support.toml_settings import assigned, change
 from ast_sim.training import loop, start
 from ast_sim.training.data_lengths import DataScales, measure, scope_of
 from ast_sim.training.defaults_from_data import resolve, resolve_training
-from ast_sim.training.rates import learning_rate, step_seed
+from ast_sim.training.rates import Schedule, step_seed
 from ast_sim.training.validation import Validated, verdict
 
 DYNAMIC = DataFacts(integration="dynamic")
@@ -56,13 +56,13 @@ def weights(folder) -> dict[str, torch.Tensor]:
 
 
 def test_learning_rate_by_hand():
-    config = TrainConfig(steps=100, warmup=10, decay=110, peak_rate=2.0)
-    assert learning_rate(config, 0) == 2.0 * 1e-4
-    assert learning_rate(config, 5) == pytest.approx(2.0 * (1e-4 + (1 - 1e-4) / 2))
-    assert learning_rate(config, 10) == 2.0
-    assert learning_rate(config, 60) == pytest.approx(1.0)  # half the cosine
-    assert learning_rate(config, 35) == pytest.approx(1 + math.cos(math.pi / 4))
-    assert learning_rate(config, 110) == 0.0
+    schedule = Schedule(steps=100, peak_rate=2.0, warmup=10, decay=110, validate_every=10, checkpoint_every=10)
+    assert schedule.rate(0) == 2.0 * 1e-4
+    assert schedule.rate(5) == pytest.approx(2.0 * (1e-4 + (1 - 1e-4) / 2))
+    assert schedule.rate(10) == 2.0
+    assert schedule.rate(60) == pytest.approx(1.0)  # half the cosine
+    assert schedule.rate(35) == pytest.approx(1 + math.cos(math.pi / 4))
+    assert schedule.rate(110) == 0.0
 
 
 def test_paper_defaults_follow_from_the_data():
