@@ -210,7 +210,7 @@ def implicit_euler(
     return ClothFrames(case, settings).trajectory(checkpoint, patient)
 
 
-class ClothFrames(Frames):
+class ClothFrames(Frames[DynamicRecord]):
     """The frames of a `ClothCase` and its solver; arguments as for `implicit_euler`."""
 
     case: ClothCase

@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from time import process_time
-from typing import Protocol
+from typing import Generic, Protocol, TypedDict, TypeVar
 
 import numpy as np
 
@@ -72,10 +72,14 @@ class FrameRecord:
 class Case(Protocol):
     """A scene, positions [S,N,3] of its prescribed nodes in each frame, its contact, and what its drawing records."""
 
-    scene: Scene
-    prescribed_position: np.ndarray
-    contact: ContactSettings
-    attributes: dict[str, AttributeValue]
+    @property
+    def scene(self) -> Scene: ...
+    @property
+    def prescribed_position(self) -> np.ndarray: ...
+    @property
+    def contact(self) -> ContactSettings: ...
+    @property
+    def attributes(self) -> dict[str, AttributeValue]: ...
 
 
 class Solver(Protocol):
@@ -84,15 +88,31 @@ class Solver(Protocol):
     The counts are Newton steps, factorizations, halved steps, and the work in joule lost to friction.
     """
 
-    iterations: int
+    @property
+    def iterations(self) -> int: ...
+    @property
+    def factorizations(self) -> int: ...
+    @property
+    def halvings(self) -> int: ...
+    @property
+    def dissipation(self) -> float: ...
+    def advance(self, target: np.ndarray, /) -> None: ...
+
+
+class Cost(TypedDict):
+    """The fields of a record that say what the solution cost."""
+
+    solve_seconds: float
+    newton_iterations: int
     factorizations: int
     halvings: int
     dissipation: float
 
-    def advance(self, target: np.ndarray) -> None: ...
+
+R = TypeVar("R", bound=FrameRecord)
 
 
-class Frames(ABC):
+class Frames(ABC, Generic[R]):
     """The frames of a sample so far, and the making of the next one.
 
     Args:
@@ -107,17 +127,17 @@ class Frames(ABC):
         driven: the nodes that the reaction is of.
     """
 
-    record_type: type[FrameRecord]
+    record_type: type[R]
 
     def __init__(self, case: Case, solver: Solver, contact: Contact) -> None:
         self.case, self.solver, self.contact = case, solver, contact
-        self.records: list[FrameRecord] = []
+        self.records: list[R] = []
         self.arrays: dict[str, list[np.ndarray]] = {}
         self._steps_before = 0
         self.driven = Driven.of(case.scene, case.prescribed_position)
 
     @abstractmethod
-    def next_frame(self) -> tuple[dict[str, np.ndarray], FrameRecord]:
+    def next_frame(self) -> tuple[dict[str, np.ndarray], R]:
         """Solve for the next frame and check it; return its arrays and its record.
 
         Raises:
@@ -186,31 +206,31 @@ class Frames(ABC):
         records = {name: self.recorded(name) for name in asdict(self.records[0])}
         attributes = {**status, **records, **self.case.attributes, **self.attributes()}
         arrays = self._stacked()
-        forces = arrays.pop(REACTION, None)
-        fields = {} if forces is None else {REACTION: NamedField(forces, "node", "N")}
-        return Trajectory(self.case.scene, attributes=attributes, fields=fields, **arrays)
+        forces = arrays.get(REACTION)
+        return Trajectory(
+            self.case.scene,
+            position=arrays["position"],
+            stress=arrays.get("stress"),
+            cauchy_stress=arrays.get("cauchy_stress"),
+            attributes=attributes,
+            fields={} if forces is None else {REACTION: NamedField(forces, "node", "N")},
+        )
 
-    def advance(self) -> dict[str, float]:
-        """Solve for the next frame; the first frame is where the solver stands.
-
-        Returns the fields of the record that say what the solution cost.
-        """
-        names = ("iterations", "factorizations", "halvings", "dissipation")
+    def advance(self) -> Cost:
+        """Solve for the next frame; the first frame is where the solver stands."""
+        solver = self.solver
         started = process_time()
-        before = [getattr(self.solver, name) for name in names]
-        self._steps_before = self.solver.iterations
+        steps, factorizations, halvings = solver.iterations, solver.factorizations, solver.halvings
+        dissipation = solver.dissipation
+        self._steps_before = steps
         if self.records:
             self.bring(len(self.records))
-        seconds = process_time() - started
-        steps, factorizations, halvings, lost = (
-            getattr(self.solver, name) - value for name, value in zip(names, before, strict=True)
-        )
         return {
-            "solve_seconds": seconds,
-            "newton_iterations": steps,
-            "factorizations": factorizations,
-            "halvings": halvings,
-            "dissipation": self.last("dissipation") + lost,
+            "solve_seconds": process_time() - started,
+            "newton_iterations": solver.iterations - steps,
+            "factorizations": solver.factorizations - factorizations,
+            "halvings": solver.halvings - halvings,
+            "dissipation": self.last("dissipation") + (solver.dissipation - dissipation),
         }
 
     def bring(self, frame: int) -> None:

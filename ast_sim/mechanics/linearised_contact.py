@@ -237,7 +237,7 @@ class NewtonSteps:
             return NearPairs(scipy.sparse.csr_array((0, len(self.system.free))), np.zeros(0), np.zeros(0))
         joined = (np.concatenate(parts) for parts in (nodes, corners, normals, shares, gaps))
         slid = SLID * (position - self._rest) if stuck is None else position - stuck
-        return self._pairs(*joined, slid)
+        return self._pairs(*joined, slid=slid)
 
     def _pairs(
         self,

@@ -45,6 +45,7 @@ class QuasiStatic:
     ) -> None:
         self.elasticity = elasticity
         self.newton = Newton(elasticity, contact, prescribed, position, settings, system)
+        self._inertia = Inertia(elasticity, np.zeros(len(position)), 1.0)
         self._damped: Newton | None = None
         self.halvings = 0
         self.load_steps = 0  # that converged
@@ -100,16 +101,14 @@ class QuasiStatic:
         newton, elasticity = self.newton, self.elasticity
         volume = elasticity.lumped_volume()
         if self._damped is None:
-            inertia = Inertia(elasticity, np.zeros(len(volume)), 1.0)
-            self._damped = Newton(inertia, newton.contact, newton.prescribed, newton.position, newton.settings)
+            self._damped = Newton(self._inertia, newton.contact, newton.prescribed, newton.position, newton.settings)
         extent = np.linalg.norm(np.ptp(newton.position, axis=0))
         # This inertia resists a motion as large as the bodies with forces as large as strains of order one give.
         weight = elasticity.unit_energy / volume.sum() / extent**2 * volume
         self._damped.watch = newton.watch
         self._damped.restart(newton.position)
         for _ in range(MAX_DAMPED_STEPS):
-            inertia = self._damped.potential
-            inertia.weight, inertia.predicted = weight, self._damped.position
+            self._inertia.weight, self._inertia.predicted = weight, self._damped.position
             before = self._damped.position
             try:
                 self._damped.step(goal)

@@ -288,7 +288,7 @@ class _Balance:
         if not len(touched):
             return forces, 0.0
         try:
-            pressed = nnls(cone[:, touched].toarray().T, forces[touched], maxiter=30 * cone.shape[0])[0]
+            pressed = nnls(cone[:, touched].toarray().T, forces[touched], maxiter=30 * (len(cone.indptr) - 1))[0]
         except RuntimeError as error:
             raise SimulationError(f"the forces of contact were not found: {error}") from error
         return forces - cone.T @ pressed, float(pressed.sum())

@@ -131,7 +131,7 @@ def solve_frame(
     return OneFrame(position, failure, seconds, began - started, *effort)
 
 
-class SolidFrames(Frames):
+class SolidFrames(Frames[SolidRecord]):
     """The frames of a quasi-static case and its solver.
 
     Args:
@@ -171,15 +171,15 @@ class SolidFrames(Frames):
             self._reactions = self._held()
         arrays = self._stored()
         checked = self.check(arrays)
-        reactions = self._reactions
-        turned = {} if self.driven.axis is None else {"torque": self._torque(reactions)}
+        reactions, nodes, axis = self._reactions, self.driven.nodes, self.driven.axis
+        turned = {} if axis is None else {"torque": axis.torque(newton.position[nodes], reactions[nodes])}
         return arrays, self.record_type(
             **cost,
             **checked,
             **turned,
             residual=newton.residual(),
             contact_area=self.contact.area(newton.state.contact),
-            reaction=float(np.linalg.norm(reactions[self.driven.nodes].sum(axis=0))),
+            reaction=float(np.linalg.norm(reactions[nodes].sum(axis=0))),
             imbalance=self._imbalance(reactions),
             elastic_energy=newton.state.potential.energy,
             contact_energy=newton.state.contact.barrier_energy(),
@@ -214,11 +214,6 @@ class SolidFrames(Frames):
             "stress": self._of_all_elements(von_mises(tensor)[:, None]),
             "cauchy_stress": self._of_all_elements(components),
         }
-
-    def _torque(self, reactions: np.ndarray) -> float:
-        """See `TurnedRecord`."""
-        nodes = self.driven.nodes
-        return self.driven.axis.torque(self.solver.newton.position[nodes], reactions[nodes])
 
     def _imbalance(self, reactions: np.ndarray) -> float:
         """See `SolidRecord`. If there are hardly any forces, the divisor is the force of a strain of 1e-3."""

@@ -101,7 +101,7 @@ class Reaction:
                 nodes = nodes[self._deforming[nodes] & ((position[nodes] > low) & (position[nodes] < high)).all(axis=1)]
                 if other == body or not len(nodes):
                     continue
-                square = igl.point_mesh_squared_distance(position[nodes], position[used], local)[0]
+                square = np.asarray(igl.point_mesh_squared_distance(position[nodes], position[used], local)[0])
                 closer = square < nearest[nodes]
                 nearest_body[nodes[closer]], nearest[nodes[closer]] = body, square[closer]
         return nearest_body

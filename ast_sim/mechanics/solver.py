@@ -33,26 +33,31 @@ class Potential(Protocol):
     @property
     def unit_force(self) -> float:
         """A nodal force in newton under a strain of order one. It is the scale for the rounding of forces."""
+        ...
 
     @property
     def unit_energy(self) -> float:
         """An energy in joule under a strain of order one. Energies that differ by its rounding count as equal."""
+        ...
 
     def evaluate(self, position: np.ndarray) -> Any:
         """The state at positions [N,3]."""
 
-    def gradient(self, state: Any) -> tuple[np.ndarray, float]:
+    def gradient(self, state: Any, /) -> tuple[np.ndarray, float]:
         """Derivative by the positions [N,3], in newton; and the mean magnitude of the forces of an element."""
+        ...
 
-    def hessian(self, state: Any, project: bool = False) -> np.ndarray:
+    def hessian(self, state: Any, /, project: bool = False) -> np.ndarray:
         """Values [P] of the second derivative's `entries`. Several values may belong to one place.
 
         Args:
             project: make the contribution of each element positive semi-definite.
         """
+        ...
 
     def entries(self) -> tuple[Entries, ...]:
         """The entries of the second derivative."""
+        ...
 
 
 class NotConverged(SimulationError):

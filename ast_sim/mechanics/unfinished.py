@@ -47,9 +47,11 @@ class Checkpoint:
         return self.path is not None and time.monotonic() - self._written >= SECONDS_BETWEEN_WRITES
 
     def save(self, arrays: dict[str, np.ndarray]) -> None:
-        """Write the arrays; there must be a path."""
+        """Write the arrays, if there is a path."""
+        if self.path is None:
+            return
         with replacing(self.path) as temporary, open(temporary, "wb") as file:
-            np.savez(file, **arrays)
+            np.savez(file, **arrays)  # pyright: ignore[reportArgumentType], allow_pickle is no name of theirs
         self._written = time.monotonic()
 
     def progress(self, frames: int, of: int, iterations: int) -> None:

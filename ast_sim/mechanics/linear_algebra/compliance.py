@@ -13,7 +13,7 @@ from typing import Protocol
 
 import numpy as np
 import scipy.sparse
-from scipy.linalg.lapack import dpotrf, dpotri
+from scipy.linalg import get_lapack_funcs
 
 from ast_sim.mechanics.linear_algebra.factorization import Factorization
 from ast_sim.mechanics.linear_algebra.linear_system import LinearSystem
@@ -23,6 +23,8 @@ ROUNDING = 1e-10  # is added to the diagonal of B, relative to its mean: equal p
 # What condensation costs, in columns (docs/log.md, 2026-11-28): 70 for a new symbolic factorization, and one for each
 # 1,000 multiplications of dense matrices per eliminated unknown. About a third of the directions is wanted.
 ANALYSIS, MULTIPLICATIONS, WANTED = 70, 1000, 1 / 3
+
+_cholesky, _inverse_of_factor = get_lapack_funcs(("potrf", "potri"))
 
 
 class Compliance(Protocol):
@@ -68,9 +70,10 @@ def compliance_of(
         watch: is called with the number of the wanted ones so far, before more of them are computed. It may raise.
     """
     touched = np.unique(directions.indices)
-    if not (system.condenses and condensation_pays(directions.shape[0], len(touched), directions.shape[1])):
+    count = len(directions.indptr) - 1
+    if not (system.condenses and condensation_pays(count, len(touched), len(system.free))):
         factor = system.factorise(values)
-        return None if factor is None else ByColumns(factor, directions, watch)
+        return None if factor is None else ByColumns(factor, len(system.free), directions, watch)
     condensed = system.condense(values, touched)
     if condensed is None:
         return None
@@ -86,12 +89,25 @@ def condensation_pays(directions: int, touched: int, unknowns: int) -> bool:
 class ByColumns:
     """By columns of L^-1 C^T. A column is zero but for the unknowns that are eliminated after the unknowns of the
     direction and depend on them: a tenth of all if the directions lie side by side. Only the rows with other numbers
-    are kept, and multiplied. For the arguments see `compliance_of`."""
+    are kept, and multiplied.
+
+    Args:
+        factor: of K.
+        unknowns: F.
+        directions, watch: see `compliance_of`.
+    """
 
     is_whole = False
 
-    def __init__(self, factor: Factorization, directions: scipy.sparse.csr_array, watch: Callable[[int], None]) -> None:
-        self._factor, self._directions, self._watch = factor, directions, watch
+    def __init__(
+        self,
+        factor: Factorization,
+        unknowns: int,
+        directions: scipy.sparse.csr_array,
+        watch: Callable[[int], None],
+    ) -> None:
+        self._factor, self._unknowns = factor, unknowns
+        self._directions, self._watch = directions, watch
         self._parts: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []  # unknowns, lefts and rights of some columns
         self._products = np.zeros((0, 0))
 
@@ -100,7 +116,7 @@ class ByColumns:
         return _regular(self._products)
 
     def want(self, wanted: np.ndarray) -> None:
-        together = max(COLUMNS, NUMBERS // self._directions.shape[1])
+        together = max(COLUMNS, NUMBERS // self._unknowns)
         for start in range(0, len(wanted), together):
             self._watch(len(self._products))
             left, right = self._factor.halves(self._directions[wanted[start : start + together]].toarray())
@@ -118,7 +134,7 @@ class ByColumns:
         return self._factor.other_half(self._factor.halves(load[None])[1][0])
 
     def displacement(self, forces: np.ndarray) -> np.ndarray:
-        rights = np.zeros(self._directions.shape[1])
+        rights = np.zeros(self._unknowns)
         first = 0
         for unknowns, _, right in self._parts:
             rights[unknowns] += forces[first : first + len(right)] @ right
@@ -187,9 +203,9 @@ def _inverse(matrix: np.ndarray) -> np.ndarray | None:
     inverse = np.zeros_like(matrix)
     for members in (np.flatnonzero(part == number) for number in range(part.max() + 1)):
         block = np.ix_(members, members)
-        lower, failure = dpotrf(matrix[block], lower=True)
+        lower, failure = _cholesky(matrix[block], lower=True)
         if failure:
             return None
-        lower = np.tril(dpotri(lower, lower=True)[0])
+        lower = np.tril(_inverse_of_factor(lower, lower=True)[0])
         inverse[block] = lower + np.tril(lower, -1).T
     return inverse

@@ -30,21 +30,30 @@ class Factorization(Protocol):
 
     def factorise(self, upper: scipy.sparse.csr_array, is_new_pattern: bool) -> bool:
         """Factorise; return False if the matrix is not positive definite."""
+        ...
 
     def condense(self, upper: scipy.sparse.csr_array, kept: np.ndarray, is_new_pattern: bool) -> np.ndarray | None:
         """Eliminate all unknowns but those `kept` [m], ascending, and return what is left of the matrix, the Schur
         complement [m, m]; None if the matrix is not positive definite. `halves` of solutions then stop at the kept
         unknowns, and `other_half` goes on from where these are solved for."""
+        ...
 
     def solve(self, right_side: np.ndarray) -> np.ndarray:
         """Solution for the matrix last factorised, to the last bits."""
+        ...
 
     def halves(self, loads: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """For loads [A, F] what half of a solution makes of them, left and right [A, F] each: the products of the left
         with the right are P K^-1 P^T. With a library that gives L both are the same array, P L^-T."""
+        ...
 
     def other_half(self, rights: np.ndarray) -> np.ndarray:
         """K^-1 P^T f [F], where `rights` [F] is the sum of the rights of the loads times the forces f."""
+        ...
+
+
+def _unknowns_of(upper: scipy.sparse.csr_array) -> int:
+    return len(upper.indptr) - 1
 
 
 @functools.cache
@@ -85,33 +94,35 @@ class Pardiso:
         """See `condense`; without kept unknowns there is nothing in the array."""
         self._matrix = upper
         is_new = is_new_pattern or self._kept is None or not np.array_equal(kept, self._kept)
+        unknowns = _unknowns_of(upper)
         try:
             if is_new:
                 self._analyse(upper, kept)
             # PARDISO writes the Schur complement where it writes solutions, in the shape of the right sides.
-            return self._called(22, np.zeros((len(kept), len(kept))) if len(kept) else np.zeros(upper.shape[0]))
+            return self._called(22, np.zeros((len(kept), len(kept))) if len(kept) else np.zeros(unknowns))
         except self._error as error:
             if error.value == self._NOT_POSITIVE_DEFINITE:
                 return None
-            raise SimulationError(f"PARDISO failed with error {error.value} ({upper.shape[0]} unknowns)") from error
+            raise SimulationError(f"PARDISO failed with error {error.value} ({unknowns} unknowns)") from error
 
     def _analyse(self, upper: scipy.sparse.csr_array, kept: np.ndarray) -> None:
         """Symbolic factorization, by a solver of its own: one that has left unknowns crashes when it leaves others."""
         if self._kept is not None:
             self._free()
         self._kept = kept
+        unknowns = _unknowns_of(upper)
         self._solver = self._pypardiso.PyPardisoSolver(mtype=2)  # real, symmetric, positive definite
         # MKL keeps the factor until it is told.
         self._free = weakref.finalize(self, self._solver.free_memory, everything=True)
-        is_small = not len(kept) and upper.shape[0] < DISSECT_FROM
+        is_small = not len(kept) and unknowns < DISSECT_FROM
         for parameter, value in ((1, 1), (2, MINIMUM_DEGREE if is_small else DISSECTION), (34, 1)):
             self._solver.set_iparm(parameter, value)
         if len(kept):
             for parameter, value in ((24, 1), (36, 2)):  # two levels, and a Schur complement
                 self._solver.set_iparm(parameter, value)
-            self._solver.perm = np.zeros(upper.shape[0], np.int32)
+            self._solver.perm = np.zeros(unknowns, np.int32)
             self._solver.perm[kept] = 1
-        self._called(11, np.zeros(upper.shape[0]))
+        self._called(11, np.zeros(unknowns))
 
     def solve(self, right_side: np.ndarray) -> np.ndarray:
         # PARDISO refines it twice, which triples the time: barriers make the matrices of the solver stiff.
@@ -142,14 +153,15 @@ class Cholmod:
     def factorise(self, upper: scipy.sparse.csr_array, is_new_pattern: bool) -> bool:
         import cholespy
 
+        solver, kind = cholespy.CholeskySolverD, cholespy.MatrixType  # pyright: ignore[reportAttributeAccessIssue], of C++
         whole = (upper + scipy.sparse.triu(upper, 1).T).tocsc()
         try:
-            self._solver = cholespy.CholeskySolverD(
+            self._solver = solver(
                 whole.shape[0],
                 whole.indptr.astype(np.int32),
                 whole.indices.astype(np.int32),
                 whole.data,
-                cholespy.MatrixType.CSC,
+                kind.CSC,
             )
         except ValueError:
             return False
