@@ -11,7 +11,7 @@ from itertools import combinations
 from typing import TextIO
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from ast_sim.element_topology import equal_rows, triangle_sides, unit_normals
 from ast_sim.mechanics.case import SolidCase
@@ -167,16 +167,16 @@ def slave_first(scene: Scene, one: int, other: int) -> tuple[int, int]:
     faces = {body: surface[body_of_face == body] for body in (one, other)}
     position = scene.rest_position.astype(np.float64)
     mesh_size = {body: _mean_edge(scene, scene.body[scene.elements[:, 0]] == body) for body in (one, other)}
-    sharpness = {}
+    sharpness: dict[int, float] = {}
     for body, opposite in ((one, other), (other, one)):
-        distance, _ = cKDTree(position[np.unique(faces[opposite])]).query(position)
+        distance, _ = KDTree(position[np.unique(faces[opposite])]).query(position)
         distance[np.setdiff1d(np.arange(scene.num_nodes), faces[body])] = np.inf
         near = distance <= distance.min() + max(mesh_size.values())
         sharpness[body] = _convex_angle(position, faces[body], near)
     if abs(sharpness[one] - sharpness[other]) > SHARPER:
-        slave = max((one, other), key=sharpness.get)
+        slave = max((one, other), key=lambda body: sharpness[body])
     else:
-        slave = min((one, other), key=mesh_size.get)
+        slave = min((one, other), key=lambda body: mesh_size[body])
     return slave, other if slave == one else one
 
 

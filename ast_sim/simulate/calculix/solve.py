@@ -107,13 +107,14 @@ def quasi_static(case: SolidCase, settings: CalculixSettings | None = None) -> T
     case, stored = case.followed()
     ccx = find_ccx()
     solver = f"calculix {version(ccx)}"
-    best: Trajectory | None = None
-    for increments in settings.ladder or (YIELDING if case.hardening else LADDER):
-        trajectory = _attempt(case, ccx, increments, settings.timeout)
-        if best is None or trajectory.num_frames > best.num_frames:
-            best = trajectory
+    first, *others = settings.ladder or (YIELDING if case.hardening else LADDER)
+    best = _attempt(case, ccx, first, settings.timeout)
+    for increments in others:
         if best.attributes["status"] == "complete":
             break
+        trajectory = _attempt(case, ccx, increments, settings.timeout)
+        if trajectory.num_frames > best.num_frames:
+            best = trajectory
     return _with_frames(replace(best, attributes={**best.attributes, "solver": solver}), stored)
 
 
@@ -143,14 +144,14 @@ def _attempt(case: SolidCase, ccx: str, increments: Increments, timeout: float) 
         with open(folder / f"{JOB}.inp", "w", encoding="ascii") as file:
             write_deck(file, case, increments)
         before = _processor_seconds()
+        results = None
         try:
             stopped_by = _run(ccx, folder, timeout)
-        finally:
-            seconds = _processor_seconds() - before
-        trajectory = _trajectory(case, _results(case, folder), increments, stopped_by, seconds)
-    except _Ended as error:
-        none = Results.none(case.scene.num_nodes, case.scene.num_elements, bool(case.hardening))
-        trajectory = _trajectory(case, none, increments, str(error), seconds)
+        except _Ended as error:
+            stopped_by = str(error)
+            results = Results.none(case.scene.num_nodes, case.scene.num_elements, bool(case.hardening))
+        seconds = _processor_seconds() - before
+        trajectory = _trajectory(case, results or _results(case, folder), increments, stopped_by, seconds)
     except SimulationError as error:
         raise SimulationError(f"{error} (deck and output are kept in {folder})") from error
     except BaseException:
@@ -226,10 +227,12 @@ def _trajectory(
     if frames < len(case.prescribed_position):
         status = {"status": "truncated", "stopped_by": f"frame {frames}: {failure or stopped_by}"}
     iterations = np.concatenate([[0], results.iterations])
+    stress, cauchy_stress = _stress_arrays(case, results.stress[: frames - 1])
     return Trajectory(
         scene=scene,
         position=position[:frames],
-        **_stress_arrays(case, results.stress[: frames - 1]),
+        stress=stress,
+        cauchy_stress=cauchy_stress,
         fields=_fields(case, results, frames),
         attributes={
             **status,
@@ -293,7 +296,7 @@ def _elasticity(case: SolidCase) -> Elasticity:
     return elastic_body(scene.rest_position.astype(np.float64), scene.elements[soft], case.material.of(soft))
 
 
-def _stress_arrays(case: SolidCase, stress: np.ndarray) -> dict[str, np.ndarray]:
+def _stress_arrays(case: SolidCase, stress: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
     """The stress arrays of a trajectory as they are stored: stress, and Cauchy stress where stress is one of elements.
 
     A frame at rest is put before the frames of `stress` [S-1,E,6].
@@ -303,10 +306,10 @@ def _stress_arrays(case: SolidCase, stress: np.ndarray) -> dict[str, np.ndarray]
     stress[:, rigid] = 0  # it has no meaning
     mises = _von_mises(stress)
     if case.stress_location == "element":
-        return {"stress": mises[:, :, None].astype(np.float32), "cauchy_stress": stress.astype(np.float32)}
+        return mises[:, :, None].astype(np.float32), stress.astype(np.float32)
     elasticity = _elasticity(case)
     nodal = np.stack([elasticity.nodal_mean(frame[~rigid]) for frame in mises])
-    return {"stress": nodal[:, :, None].astype(np.float32)}
+    return nodal[:, :, None].astype(np.float32), None
 
 
 def _von_mises(stress: np.ndarray) -> np.ndarray:

@@ -87,6 +87,7 @@ def draw_geometry(rng: np.random.Generator, nodes: int = DEFAULT_NODES, parts: P
         SimulationError: none of `DRAWS` draws gave a pair that can be used. The text says why the last could not.
     """
     parts = part_source() if parts is None else parts
+    reason: SimulationError | None = None
     for _ in range(DRAWS):
         try:
             mesh = parts.draw(rng)
@@ -134,7 +135,8 @@ def _check_walls(pair: PairOfParts) -> None:
 
 
 def _draw_squeeze(rng: np.random.Generator, pair: PairOfParts, parts: tuple[Part, Part], mesher: str) -> _Squeeze:
-    young = np.exp(rng.uniform(*np.log(YOUNG), 2))
+    low, high = np.log(YOUNG)
+    young = np.exp(rng.uniform(low, high, 2))
     poisson, crush = rng.uniform(*POISSON, 2), rng.uniform(*CRUSH)
     attributes: dict[str, AttributeValue] = {
         "parts": f"{parts[0].name}, {parts[1].name}",

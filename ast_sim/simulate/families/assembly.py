@@ -162,8 +162,10 @@ def _sized(spec: AssemblySpec, values: Values, nodes: int | None) -> tuple[float
     """The factor of all element sizes with which the scene has about that many nodes, and the parts."""
     factor = 1.0
     parts = placed(spec, values)
+    if not nodes:
+        return factor, parts
     best, power = (factor, parts), USUAL_POWER
-    for _ in range(MESHES if nodes else 0):
+    for _ in range(MESHES):
         count = sum(len(part.position) for part in parts)
         if abs(count - nodes) < abs(sum(len(part.position) for part in best[1]) - nodes):
             best = factor, parts

@@ -32,8 +32,9 @@ DEFAULT_NODES = 1300
 MINIMUM_NODES = 80
 SECOND_ORDER_NODES = 400  # at least, of a scene of second-order elements
 MINIMUM_FRAMES = 3  # a press and its release need this many
-MATERIAL = NeoHookean(young=1e6, poisson=0.4)
-CONTACT = ContactSettings(dhat=1e-3, stiffness=MATERIAL.young)
+YOUNG = 1e6  # pascal
+MATERIAL = NeoHookean(YOUNG, poisson=0.4)
+CONTACT = ContactSettings(dhat=1e-3, stiffness=YOUNG)
 SETTINGS = SolverSettings()
 LAYERS = {1: 2, 2: 1}  # of elements through the thickness, by their order: three nodes lie across it either way
 ACROSS = 3

@@ -6,6 +6,7 @@ Legend: N nodes, E tetrahedra; lengths in metres.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import permutations
 
 import numpy as np
@@ -36,7 +37,7 @@ def kuhn_tetrahedra() -> np.ndarray:
     return np.array(paths)
 
 
-def hexahedral_grid(shape: tuple[int, int, int], keep: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+def hexahedral_grid(shape: Sequence[int], keep: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Grid of shape[0] x shape[1] x shape[2] cells cut into tetrahedra.
 
     Args:
@@ -55,9 +56,7 @@ def hexahedral_grid(shape: tuple[int, int, int], keep: np.ndarray | None = None)
     return coordinates, elements.reshape(-1, 4)
 
 
-def plate(
-    size: tuple[float, float, float], cells: tuple[int, int, int], holes: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def plate(size: Sequence[float], cells: Sequence[int], holes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Plate centred at the origin, its long side along x, with round holes through its thickness.
 
     Args:
@@ -68,13 +67,12 @@ def plate(
     Returns:
         Positions [N,3] ordered along x, tetrahedra [E,4].
     """
-    size, shape = np.asarray(size, float), np.asarray(cells)
-    x, y = [(np.arange(n) + 0.5) * (length / n) - length / 2 for n, length in zip(shape[:2], size[:2], strict=True)]
-    solid = np.ones(shape[:2], bool)
+    x, y = [(np.arange(n) + 0.5) * (length / n) - length / 2 for n, length in zip(cells[:2], size[:2], strict=True)]
+    solid = np.ones(cells[:2], bool)
     for centre_x, centre_y, radius in np.reshape(holes, (-1, 3)):
         solid &= np.hypot(x[:, None] - centre_x, y[None, :] - centre_y) >= radius
-    coordinates, elements = hexahedral_grid(tuple(shape), np.repeat(solid[:, :, None], shape[2], axis=2))
-    return (coordinates / shape - 0.5) * size, elements
+    coordinates, elements = hexahedral_grid(cells, np.repeat(solid[:, :, None], cells[2], axis=2))
+    return (coordinates / np.asarray(cells) - 0.5) * np.asarray(size), elements
 
 
 def _cube(cells: int) -> tuple[np.ndarray, np.ndarray]:

@@ -6,7 +6,7 @@ Legend: N nodes, E tetrahedra, F triangles; lengths in the units of the part.
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from ast_sim.element_topology import FACE_TRIANGLES, LOCAL_FACES, equal_rows, triangle_sides
 from ast_sim.mechanics.contact_and_friction import load_ipctk
@@ -135,7 +135,7 @@ def _check_points(position: np.ndarray, name: str, what: str) -> None:
     if not finite.all():
         index = int(np.argmin(finite))
         raise BadMesh(f"{name}: the position of node {index} is not finite: {point(position[index])}")
-    pairs = cKDTree(position).query_pairs(SAME_PLACE * _diagonal(position), output_type="ndarray")
+    pairs = KDTree(position).query_pairs(SAME_PLACE * _diagonal(position), output_type="ndarray")
     if len(pairs):
         a, b = pairs[np.lexsort(pairs.T[::-1])[0]]
         raise BadMesh(

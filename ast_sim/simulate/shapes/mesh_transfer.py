@@ -41,7 +41,8 @@ def _owners(rest: np.ndarray, corners: np.ndarray, points: np.ndarray) -> np.nda
     if not len(outside):
         return owner
     count = min(_NEAREST, len(corners))
-    _, tried = KDTree(rest[corners].mean(axis=1)).query(points[outside], k=range(1, count + 1))
+    _, tried = KDTree(rest[corners].mean(axis=1)).query(points[outside], k=count)
+    tried = tried.reshape(-1, count)  # also of one
     weights = _barycentric(rest[corners[tried]].reshape(-1, 4, 3), np.repeat(points[outside], count, axis=0))
     depth = (weights * _heights(rest[corners])[tried.ravel()]).min(axis=1).reshape(-1, count)
     owner[outside] = np.take_along_axis(tried, depth.argmax(axis=1)[:, None], axis=1)[:, 0]

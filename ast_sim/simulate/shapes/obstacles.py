@@ -65,7 +65,8 @@ def _second_order(cells: int) -> np.ndarray:
     """[E,10] tetrahedra two cells long over the nodes of a cube of cells: their middles lie on the shape, too."""
     position, elements = mesh.second_order(*mesh.block((1.0, 1.0, 1.0), cells // 2))
     place = np.rint((position + 1) * cells / 2).astype(int)
-    return np.ravel_multi_index(tuple(place.T), (cells + 1,) * 3)[elements]
+    number = place @ np.array([(cells + 1) ** 2, cells + 1, 1])
+    return number[elements]
 
 
 def draw_obstacle(rng: np.random.Generator, cells: int, order: int = 1) -> tuple[str, np.ndarray, np.ndarray]:

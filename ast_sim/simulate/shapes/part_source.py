@@ -34,25 +34,27 @@ class Mesher(Protocol):
         Raises:
             BadMesh, MeshingFailed: these parts cannot be used. Others may be.
         """
+        ...
 
 
 class PartSource(Protocol):
-    """Gives pairs of parts.
+    """Gives pairs of parts."""
 
-    Attributes:
-        mesher: name and version of what makes the meshes.
-    """
-
-    mesher: str
+    @property
+    def mesher(self) -> str:
+        """Name and version of what makes the meshes."""
+        ...
 
     def describe(self) -> dict[str, Any]:
         """All that the parts depend on except the random numbers, as JSON values."""
+        ...
 
     def check(self) -> None:
         """Raise SimulationError if a part that may be drawn is broken."""
 
     def draw(self, rng: np.random.Generator) -> Mesher:
         """Two parts, ready to be meshed."""
+        ...
 
 
 def part_source(parts: Path | None = None) -> PartSource:

@@ -80,13 +80,13 @@ Build = Callable[[float], tuple[np.ndarray, np.ndarray]]  # size of the cells ->
 
 def _of_size(build: Build, nodes: int) -> tuple[np.ndarray, np.ndarray]:
     """The mesh whose number of nodes is nearest to the wanted one. Cells are whole, so the numbers come in steps."""
-    spacing, best = nodes ** (-1 / 3), None
-    for _ in range(10):
+    spacing = nodes ** (-1 / 3)
+    best = mesh = build(spacing)
+    for _ in range(9):
+        spacing *= (len(mesh[0]) / nodes) ** (1 / 3)
         mesh = build(spacing)
-        count = len(mesh[0])
-        if best is None or abs(count - nodes) < abs(len(best[0]) - nodes):
+        if abs(len(mesh[0]) - nodes) < abs(len(best[0]) - nodes):
             best = mesh
-        spacing *= (count / nodes) ** (1 / 3)
     return best
 
 
@@ -151,7 +151,7 @@ def _split(ends: list[float] | np.ndarray, spacing: float) -> np.ndarray:
 
 def rectilinear(lines: list[np.ndarray], keep: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Mesh of the cells between grid lines along x, y, z that `keep` selects: positions [N,3], tetrahedra [E,4]."""
-    coordinates, elements = hexahedral_grid(tuple(len(line) - 1 for line in lines), keep)
+    coordinates, elements = hexahedral_grid([len(line) - 1 for line in lines], keep)
     position = np.column_stack([line[index] for line, index in zip(lines, coordinates.T, strict=True)])
     return position, oriented(position, elements)
 

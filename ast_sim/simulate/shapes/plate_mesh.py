@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import Delaunay, cKDTree
+from scipy.spatial import Delaunay, KDTree
 
 from ast_sim.element_topology import triangle_sides
 
@@ -34,7 +34,7 @@ class PlaneMesh:
     pieces: list[np.ndarray]
 
 
-def spacing_for(points: int, area: float, perimeter: float) -> float:
+def spacing_for(points: float, area: float, perimeter: float) -> float:
     """Length of the edges of a mesh with `points` nodes.
 
     By Euler's formula P = T/2 + B/2 + 1 - holes, with T equilateral triangles on the area and B edges on the curves.
@@ -113,7 +113,7 @@ def _lattice(rim: np.ndarray, edges: np.ndarray, curves: np.ndarray, spacing: fl
     j, i = np.meshgrid(np.arange(rows), np.arange(columns))
     grid = np.stack([i + j % 2 / 2, j * np.sqrt(3) / 2], axis=2).reshape(-1, 2) * spacing
     grid += (low + high) / 2 - grid.mean(axis=0)
-    distance, _ = cKDTree(np.concatenate([rim, curves])).query(grid)
+    distance, _ = KDTree(np.concatenate([rim, curves])).query(grid)
     return grid[(distance > CLEARANCE * spacing) & inside(grid, rim[edges[:, 0]], rim[edges[:, 1]])]
 
 

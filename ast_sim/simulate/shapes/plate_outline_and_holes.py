@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from ast_sim.simulate.shapes.plate_mesh import inside, resample
 
@@ -115,7 +115,7 @@ def _draw_hole(rng: np.random.Generator, length: float, width: float) -> tuple[s
 
 def _is_apart(curve: np.ndarray, others: list[np.ndarray], distance: float) -> bool:
     """Whether a curve keeps this distance from all others."""
-    return cKDTree(np.concatenate([_dense(other) for other in others])).query(curve)[0].min() >= distance
+    return KDTree(np.concatenate([_dense(other) for other in others])).query(curve)[0].min() >= distance
 
 
 def _dense(curve: np.ndarray) -> np.ndarray:

@@ -30,11 +30,11 @@ def box(low: Sequence[float], high: Sequence[float], cells: Sequence[int], **arr
         ConfigError: a size or a number of cells is not above 0.
         DatasetError: these are no numbers, or not three where three are needed.
     """
-    low, high = three_numbers("the box", "low", low), three_numbers("the box", "high", high)
-    size = np.subtract(high, low)
+    start, end = three_numbers("the box", "low", low), three_numbers("the box", "high", high)
+    size = np.subtract(end, start)
     cells = _above_zero("the box", size, cells)
-    coordinates, elements = mesh.hexahedral_grid(tuple(cells))
-    return Scene.of(coordinates / np.asarray(cells) * size + low, elements, **arrays)
+    coordinates, elements = mesh.hexahedral_grid(cells)
+    return Scene.of(coordinates / np.asarray(cells) * size + start, elements, **arrays)
 
 
 def plate(size: Sequence[float], cells: Sequence[int], holes: Sequence[Sequence[float]] = (), **arrays: Any) -> Scene:
@@ -50,14 +50,14 @@ def plate(size: Sequence[float], cells: Sequence[int], holes: Sequence[Sequence[
         ConfigError: a size or a number of cells is not above 0, or a hole leaves out no cell.
         DatasetError: these are no numbers, or not three where three are needed.
     """
-    size = three_numbers("the plate", "size", size)
-    cells = _above_zero("the plate", size, cells)
+    lengths = three_numbers("the plate", "size", size)
+    cells = _above_zero("the plate", lengths, cells)
     cut = real_numbers("the plate", "holes", holes).astype(np.float64)
     if cut.size and (cut.ndim != 2 or cut.shape[1] != 3 or not (cut[:, 2] > 0).all() or not np.isfinite(cut).all()):
         raise ConfigError("the holes of the plate must be triples: centre x, centre y and a radius above 0")
     for hole in cut.reshape(-1, 3):
-        _require_cut(size, cells, hole)
-    return Scene.of(*mesh.plate(tuple(size), tuple(cells), cut.reshape(-1, 3)), **arrays)
+        _require_cut(lengths, cells, hole)
+    return Scene.of(*mesh.plate(lengths.tolist(), cells, cut.reshape(-1, 3)), **arrays)
 
 
 def _require_cut(size: np.ndarray, cells: Sequence[int], hole: np.ndarray) -> None:
@@ -84,9 +84,9 @@ def ball(center: Sequence[float], radius: float, cells: int, **arrays: Any) -> S
         DatasetError: these are no numbers, or not three where three are needed.
     """
     _above_zero("the ball", [radius], [cells], even=True)
-    center = three_numbers("the ball", "center", center)
+    middle = three_numbers("the ball", "center", center)
     position, elements = mesh.ball(radius, cells)
-    return Scene.of(position + center, elements, **arrays)
+    return Scene.of(position + middle, elements, **arrays)
 
 
 def cylinder(
@@ -106,11 +106,11 @@ def cylinder(
         DatasetError: these are no numbers, or not three where three are needed.
     """
     _above_zero("the cylinder", [radius, length], [cells], even=True)
-    center = three_numbers("the cylinder", "center", center)
+    middle = three_numbers("the cylinder", "center", center)
     if axis not in ("x", "y", "z"):
         raise ConfigError(f"the axis of the cylinder is {axis!r}; must be x, y or z")
     position, elements = mesh.cylinder(radius, length / 2, cells)
-    return Scene.of(np.roll(position, "xyz".index(axis), axis=1) + center, elements, **arrays)
+    return Scene.of(np.roll(position, "xyz".index(axis), axis=1) + middle, elements, **arrays)
 
 
 def _above_zero(what: str, sizes: Sequence[float] | np.ndarray, cells: Sequence[int], even: bool = False) -> list[int]:
@@ -119,7 +119,7 @@ def _above_zero(what: str, sizes: Sequence[float] | np.ndarray, cells: Sequence[
         shown = ", ".join(f"{size:g}" for size in sizes)
         raise ConfigError(f"{what} has the size [{shown}]; every size must be above 0")
     counts = several("cells", cells, "three numbers of cells")
-    whole = all(isinstance(count, Integral) and not isinstance(count, bool) and count > 0 for count in counts)
+    whole = all(isinstance(count, Integral) and not isinstance(count, bool) and int(count) > 0 for count in counts)
     if not whole or len(counts) != (1 if even else 3) or (even and counts[0] % 2):
         needs = "an even whole number" if even else "three whole numbers"
         raise ConfigError(f"{what} has {counts} cells; must be {needs} above 0")

@@ -90,7 +90,9 @@ def pick_solid(gmsh, solid: str | int | None) -> None:
         return
     boxes = [np.split(np.array(gmsh.model.getBoundingBox(*volume)), 2) for volume in volumes]
     names = [gmsh.model.getEntityName(*volume) for volume in volumes]
-    told = several_solids([(name.rpartition("/")[2], *box) for name, box in zip(names, boxes, strict=True)])
+    told = several_solids(
+        [(name.rpartition("/")[2], low, high) for name, (low, high) in zip(names, boxes, strict=True)]
+    )
     if solid is None:
         raise BadPart(told)
     if isinstance(solid, int):

@@ -82,7 +82,7 @@ def main() -> None:
     for i, (model, (position, elements)) in enumerate(zip(models, meshes, strict=True)):
         arrays |= {f"position_{i}": position, f"elements_{i}": elements, f"scale_{i}": np.array(model.scale)}
     buffer = io.BytesIO()
-    np.savez(buffer, **arrays)
+    np.savez(buffer, **arrays)  # pyright: ignore[reportArgumentType], allow_pickle is no name of theirs
     answer.write(buffer.getvalue())
     answer.close()
 
@@ -177,17 +177,19 @@ def _load_stl(gmsh, name: str, part: dict[str, Any]) -> PartModel:
 
 def _mesh_all(gmsh, models: list[PartModel], nodes: int) -> list[tuple[np.ndarray, np.ndarray]]:
     """Meshes of all parts with one element size, which is sought until they have about `nodes` nodes together."""
-    correction, best = 1.0, None
+    correction, nearest = 1.0, math.inf
+    best: list[tuple[np.ndarray, np.ndarray]] = []
     for _ in range(MESHES):
         size = _element_size(models, nodes / correction)
         meshes = [_mesh(gmsh, model, size) for model in models]
         count = sum(len(position) for position, _ in meshes)
-        if best is None or abs(count - nodes) < abs(best[0] - nodes):
-            best = count, meshes
-        if abs(count - nodes) <= NODE_TOLERANCE * nodes:
+        off = abs(count - nodes)
+        if off < nearest:
+            nearest, best = off, meshes
+        if off <= NODE_TOLERANCE * nodes:
             break
         correction = count / _expected(models, size)
-    return best[1]
+    return best
 
 
 def _expected(models: list[PartModel], size: float) -> float:

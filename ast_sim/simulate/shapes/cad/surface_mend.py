@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from ast_sim.element_topology import equal_rows, triangle_sides
 from ast_sim.importers.formats.stl_file import BadSurface, StlFile, read_stl
@@ -119,7 +119,7 @@ def _joined(corners: np.ndarray, tolerance: float) -> TriangleSurface:
     """Corners closer than `tolerance` diagonals become one; triangles without an area go."""
     points, triangles = _exactly_joined(corners)
     diagonal = float(np.linalg.norm(np.ptp(points, axis=0)))
-    pairs = cKDTree(points).query_pairs(tolerance * diagonal, output_type="ndarray")
+    pairs = KDTree(points).query_pairs(tolerance * diagonal, output_type="ndarray")
     place = connected_parts(pairs, len(points))
     position, triangles = points[np.unique(place, return_index=True)[1]], place[triangles]
     points_alone = (triangles == np.roll(triangles, 1, axis=1)).any(axis=1)
