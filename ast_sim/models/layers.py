@@ -11,9 +11,9 @@ from ast_sim.ops import linear, mlp
 class Linear(nn.Linear):
     """y = act(W x + b) + residual."""
 
-    def forward(self, x: Tensor, activation: str = "none", residual: Tensor | None = None) -> Tensor:
-        """x [M, inputs] -> [M, outputs], or half of them with "geglu"; residual has the shape of the result."""
-        return linear(x, self.weight, self.bias, activation, residual)
+    def forward(self, input: Tensor, activation: str = "none", residual: Tensor | None = None) -> Tensor:
+        """input [M, inputs] -> [M, outputs], or half of them with "geglu"; residual has the shape of the result."""
+        return linear(input, self.weight, self.bias, activation, residual)
 
 
 class FactorizedLinear(nn.Module):
@@ -36,7 +36,7 @@ class FactorizedLinear(nn.Module):
         return self.g[:, None] * self.V
 
 
-def layer(inputs: int, outputs: int, factorized: bool = False, bias: bool = True) -> nn.Module:
+def layer(inputs: int, outputs: int, factorized: bool = False, bias: bool = True) -> Linear | FactorizedLinear:
     """A layer, factorized or plain. Both start with W = Glorot uniform and b = 0."""
     if factorized:
         return FactorizedLinear(inputs, outputs)

@@ -49,6 +49,9 @@ class Statistics:
 class Normalizer(nn.Module):
     """(x - mean) / scale with one mean and one scale for all components, which `fix` sets."""
 
+    mean: Tensor
+    scale: Tensor
+
     def __init__(self, kind: Kind | None, shape: tuple[int, ...] = ()):
         super().__init__()
         self.register_buffer("mean", torch.zeros(shape))

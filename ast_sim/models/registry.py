@@ -55,7 +55,7 @@ def find_model(name: str) -> Model:
     if not entries:
         raise _missing("model", name, model_names())
     if len(entries) > 1:
-        packages = ", ".join(entry.dist.name for entry in entries)
+        packages = ", ".join(map(_package, entries))
         raise ConfigError(f"several packages have a model {name}: {packages}: uninstall all but one")
     entry = entries[0]
     try:
@@ -64,7 +64,7 @@ def find_model(name: str) -> Model:
             raise TypeError(f"{entry.value} is no Model whose settings have the name {name!r}")
     except Exception as error:  # whatever a package does when it is imported
         raise ConfigError(
-            f"the model {name} of the package {entry.dist.name} cannot be imported: {type(error).__name__}: {error}:"
+            f"the model {name} of the package {_package(entry)} cannot be imported: {type(error).__name__}: {error}:"
             " mend that package or uninstall it"
         ) from error
     return model
@@ -95,6 +95,11 @@ def trained_model(config: ModelConfig, weights: Mapping[str, Tensor]) -> Simulat
         model = build_model(config)
     model.load_state_dict(weights)
     return model.eval()
+
+
+def _package(entry: EntryPoint) -> str:
+    """The name of the package that registers a model; of its module, if no package is known."""
+    return entry.module if entry.dist is None else entry.dist.name
 
 
 def _missing(what: str, name: str, known: Iterable[str]) -> ConfigError:

@@ -57,10 +57,10 @@ class Trial:
 
 def candidates(base: RunConfig, preset: str) -> dict[str, RunConfig]:
     """The settings that are tried, by name: three learning rates, and a wider model."""
+    rate = base.train.peak_rate
+    assert rate is not None  # a plan requires one
     tried = {
-        preset + name: dataclasses.replace(
-            base, train=dataclasses.replace(base.train, peak_rate=factor * base.train.peak_rate)
-        )
+        preset + name: dataclasses.replace(base, train=dataclasses.replace(base.train, peak_rate=factor * rate))
         for name, factor in RATES.items()
     }
     widths = {name: getattr(base.model, name) for name in WIDTHS if isinstance(getattr(base.model, name, None), int)}

@@ -72,9 +72,15 @@ class ASTConfig(ProximityConfig):
             )
 
     @property
+    def level(self) -> int:
+        """`L_cell` of resolved settings."""
+        assert self.L_cell is not None, "the settings of the model are not resolved"
+        return self.L_cell
+
+    @property
     def cell_side(self) -> float:
         """See `ModelConfig`. The side is 2^(1-L) half widths (paper, section Sparse Convolution)."""
-        return self.data.domain_half_width * 2.0 ** (1 - self.L_cell)
+        return self.data.domain_half_width * 2.0 ** (1 - self.level)
 
     def resolve(self, facts: DataFacts) -> Self:
         """See `ProximityConfig`. An unset L_cell follows from the mesh spacing. Dynamic scenes get no exchanges:

@@ -57,7 +57,7 @@ def doublings(config: ASTConfig, position: Tensor) -> int | None:
     """How often the domain must double around its centre to hold positions [N, 3]; None if L would pass 21."""
     center = torch.tensor(config.data.domain_center, dtype=torch.float64)
     reach = float((position.double() - center).abs().max()) if len(position) else 0.0
-    for growth in range(22 - config.L_cell):
+    for growth in range(22 - config.level):
         if reach <= config.data.domain_half_width * 2.0**growth:
             return growth
     return None
@@ -86,7 +86,7 @@ def build_cells(config: ASTConfig, position: Tensor, offsets: Tensor, may_grow: 
             f"a node is so far from the domain centre {config.data.domain_center} that the octree would pass level 21"
         )
     try:
-        half_width, depth = config.data.domain_half_width * 2.0**growth, config.L_cell + growth
+        half_width, depth = config.data.domain_half_width * 2.0**growth, config.level + growth
         finest = octree(position, offsets, config.data.domain_center, half_width, depth)
     except ValueError as problem:
         advice = "; give the dataset a domain_half_width that holds all frames with train.noise and train.shift"

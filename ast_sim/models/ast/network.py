@@ -52,7 +52,7 @@ class AST(Simulator):
         self.down = nn.ModuleList(SparseConv(width, up=False) for _ in range(c.l_ocnn))
         self.lift = Linear(width, c.d_token)
         if c.places == "absolute":
-            self.position_embedding = PositionEmbedding(c.d_token, c.L_cell - c.l_ocnn)
+            self.position_embedding = PositionEmbedding(c.d_token, c.level - c.l_ocnn)
         self.to_tokens = AttentionBlock(c, c.d_token, c.d_token)
         self.processor = nn.Sequential(*(AttentionBlock(c, c.d_token) for _ in range(c.L_SA)))
         if c.exchanges:

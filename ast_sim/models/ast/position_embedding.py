@@ -17,6 +17,8 @@ class PositionEmbedding(nn.Module):
     At the centres of cells of level L the waves with j >= L are constant, so they are left out.
     """
 
+    frequency: Tensor
+
     def __init__(self, width: int, level: int):
         super().__init__()
         self.register_buffer("frequency", math.pi * 2.0 ** torch.arange(min(8, level)), persistent=False)

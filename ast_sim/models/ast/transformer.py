@@ -94,11 +94,16 @@ class AttentionBlock(nn.Module):
             key_value,
             *(one for layer in layers for one in _of(layer)),
         )
-        turns = (
-            None if x.rotations is None else torch.view_as_real(x.rotations).flatten(1) for x in (vectors, context)
+        return attention_block(
+            vectors.x,
+            context.x,
+            _as_real(vectors.rotations),
+            _as_real(context.rotations),
+            vectors.offsets,
+            context.offsets,
+            parameters,
+            self.heads,
         )
-        offsets = vectors.offsets, context.offsets
-        return attention_block(vectors.x, context.x, *turns, *offsets, parameters, self.heads)
 
     def _mixed(self, vectors: Vectors, context: Vectors | None, dropout: float) -> Tensor:
         """[T, H, D]: what attention makes of the values."""
@@ -112,6 +117,11 @@ class AttentionBlock(nn.Module):
         q, k = rotated(q, vectors.rotations), rotated(k, context.rotations)
         seed = int(torch.randint(2**62, (1,))) if dropout else 0
         return attention(q, k, v, vectors.offsets, context.offsets, dropout_p=dropout, seed=seed)[0]
+
+
+def _as_real(rotations: Tensor | None) -> Tensor | None:
+    """[T, D]: cosine and sine of each pair of channels."""
+    return None if rotations is None else torch.view_as_real(rotations).flatten(1)
 
 
 def _of(layer: nn.LayerNorm | Linear) -> tuple[Tensor, Tensor]:
