@@ -370,6 +370,17 @@ def test_a_run_that_crashes_or_takes_too_long_leaves_the_frame_at_rest(tmp_path,
     assert [path.name for path in tmp_path.iterdir()] == ["ccx"]
 
 
+def test_an_error_after_a_run_that_crashed_names_its_folder(tmp_path, monkeypatch):
+    def refuse(*arguments):
+        raise SimulationError("no frame")
+
+    fake_ccx(tmp_path, monkeypatch, "kill -SEGV $$")
+    monkeypatch.setattr(calculix, "_trajectory", refuse)
+    with pytest.raises(SimulationError, match=r"no frame \(deck and output are kept in .*\)") as error:
+        calculix.quasi_static(uniaxial(np.array([1, 1.1])))
+    assert (Path(str(error.value).rpartition(" kept in ")[2].rstrip(")")) / "case.inp").exists()
+
+
 def test_a_run_leaves_nothing_behind(tmp_path, monkeypatch):
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     monkeypatch.setattr("tempfile.tempdir", None)
