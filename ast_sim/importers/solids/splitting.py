@@ -62,14 +62,6 @@ def _triangles(faces: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
     return [(turned[:, [0, 1, 2]], everyone), (turned[:, [0, 2, 3]], everyone)]
 
 
-def triangles_of(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """[t, 3] the triangles of triangles or quadrilaterals [f, 3 or 4], and the row that each belongs to."""
-    parts = _triangles(faces)
-    owner = np.concatenate([rows for _, rows in parts])
-    order = np.argsort(owner, kind="stable")
-    return np.concatenate([triangles for triangles, _ in parts])[order], owner[order]
-
-
 def faces_of(shape: str, cells: np.ndarray) -> list[np.ndarray]:
     """The faces of cells of one shape, [c, 3] or [c, 4] for each face of the shape."""
     if shape in ("triangle", "quad"):
