@@ -211,13 +211,13 @@ Made by `python -m benchmarks.studies.assembly` from `benchmarks/results/assembl
 
 Each product of `examples` was generated, trained and asked for frames of test scenes, on one thread. "Error" is the
 error of the displacement on the free nodes at the deepest frame, relative to the displacement (mean and standard
-error); "one call" is that of the network alone. "Reaction" is the error of the force that moves the tool, in the last
-frame. "Largest stress" is the error of the largest von Mises stress. The solver goes to the same frame at its own stop
-test: straight in one, two or four load steps and frame by frame, whichever is fastest. "Fastest setting" is the fastest
-of {settings} whose error is at most the answer's: looser stop tests, coarser meshes, and the same Newton steps without
-a model. All times count what is prepared for a mesh. An answer's time is the median over the test scenes; the solver's
-are medians over the scenes where it was run (ten; one of 6,000 nodes). "Pays after" is the number of questions whose
-answers save as much time as the simulations and the training took.
+error); "one call" is the error of the network alone. "Reaction" is the error of the force that moves the tool, in the
+last frame. "Largest stress" is the error of the largest von Mises stress. The solver goes to the same frame at its own
+stop test: straight in one, two or four load steps and frame by frame, whichever is fastest. "Fastest setting" is the
+fastest of {settings} whose error is at most the answer's: looser stop tests, coarser meshes, and the same Newton steps
+without a model. All times count what is prepared for a mesh. An answer's time is the median over the test scenes; the
+solver's are medians over the scenes where it was run. "Pays after" is the number of questions whose answers save as
+much time as the simulations and the training took.
 """
 
 _TOGETHER = """

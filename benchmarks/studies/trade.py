@@ -49,9 +49,6 @@ ROWS = {
     "plates1300": Row("Plates, 1,300 nodes", "plates1300", 15),
     "plates1300_second_order": Row("Plates, 1,300 nodes, second-order", "plates1300_second_order", 15),
     "parts400": Row("Pairs of parts, 400 nodes, with friction", "parts400_long", 15),
-    "parts400_10000": Row(
-        "Pairs of parts, 10,000 steps, beside Transolver", "parts400", 15, beside="parts400_transolver"
-    ),
     "snap_hook": Row("Snap hook, second-order elements, with friction", "snap_hook", 15, beside="snap_hook_transolver"),
     "bumper": Row("Bumper, second-order elements, with friction", "bumper", 15),
 }
