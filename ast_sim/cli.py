@@ -28,6 +28,7 @@ from ast_sim.support.argument_types import (
     read_by,
     whole_numbers,
 )
+from ast_sim.support.environment import check_variables
 from ast_sim.support.errors import AstSimError, LooksWrong, printable
 from ast_sim.support.stop_signals import Interrupted
 
@@ -45,6 +46,7 @@ def main(argv: list[str] | None = None) -> int:
     args.command_line = shlex.join(["ast-sim", *(sys.argv[1:] if argv is None else argv)])
     warnings.showwarning = lambda message, category, *_: _show(message, category)
     try:
+        check_variables()
         args.run(args)
         sys.stdout.flush()
         return 0

@@ -12,7 +12,6 @@ an op must be the same for every sample.
 from __future__ import annotations
 
 import ctypes
-import os
 import sys
 import warnings
 from collections.abc import Callable, Sequence
@@ -28,10 +27,10 @@ from torch.autograd import forward_ad
 from torch.fx.experimental.proxy_tensor import disable_proxy_modes_tracing
 
 from ast_sim.ops.spec import Argument, Given, Sizes, Spec, check
+from ast_sim.support.environment import c_core, check_variables, variable
 
-BACKEND = os.environ.get("AST_SIM_BACKEND", "c")
-if BACKEND not in ("c", "torch"):
-    raise ImportError(f"AST_SIM_BACKEND={BACKEND} is unknown: choose c or torch")
+check_variables()
+BACKEND = variable("AST_SIM_BACKEND")
 
 LIBRARY = torch.library.Library("ast_sim", "DEF")
 
@@ -53,8 +52,7 @@ def _share_torch_threads() -> None:
 
 
 if TYPE_CHECKING or BACKEND == "c":
-    from ast_sim import _C
-
+    _C = c_core()
     _share_torch_threads()
 
 
@@ -345,6 +343,6 @@ def keep_memory() -> bool:
     Returns:
         Whether it had an effect.
     """
-    if BACKEND == "torch" or os.environ.get("AST_SIM_KEEP_MEMORY") == "0":
+    if BACKEND == "torch" or variable("AST_SIM_KEEP_MEMORY") == "0":
         return False
     return _C.keep_memory()

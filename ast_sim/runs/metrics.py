@@ -8,9 +8,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from ast_sim.runs.sealed_line import seal, unseal
 from ast_sim.support.disk import write_text
 from ast_sim.support.errors import CheckpointError, warn
-from ast_sim.support.sealed_line import seal, unseal
 
 METRICS = "metrics.jsonl"
 

@@ -32,10 +32,10 @@ from ast_sim.runs.folder import Chosen, RunFolder
 from ast_sim.runs.metrics import METRICS, Metrics
 from ast_sim.runs.model_card import card
 from ast_sim.runs.scope import Scope
+from ast_sim.runs.sealed_line import seal, unseal
 from ast_sim.runs.train_config import RunConfig
 from ast_sim.support.disk import replacing
 from ast_sim.support.errors import CheckpointError, ConfigError
-from ast_sim.support.sealed_line import seal, unseal
 from ast_sim.support.toml_settings import from_values, to_values
 
 SUFFIX = ".ast"

@@ -276,7 +276,7 @@ def test_a_failure_is_tried_again(tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setenv("AST_SIM_BACKEND", "broken")
         (found,) = study.conduct(plan, entries, data, tmp_path / "runs", 1, {})
-    assert "AST_SIM_BACKEND=broken is unknown" in found["ast"]["runs"][0]["failed"]
+    assert "AST_SIM_BACKEND=broken: choose c or torch" in found["ast"]["runs"][0]["failed"]
     (found,) = study.conduct(plan, entries, data, tmp_path / "runs", 1, {})
     assert "measured" in found["ast"]["runs"][0]
 

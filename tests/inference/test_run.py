@@ -9,9 +9,9 @@ import toy
 from ast_sim.dataset.reader import Dataset
 from ast_sim.dataset.writer import DatasetWriter
 from ast_sim.inference.trained_run import Run
+from ast_sim.runs.sealed_line import seal
 from ast_sim.scene import NodeType, Scene, Trajectory
 from ast_sim.support.errors import DatasetError
-from ast_sim.support.sealed_line import seal
 from ast_sim.training.configure import configure
 from ast_sim.training.start import start_training
 

@@ -22,7 +22,6 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-import ast_sim
 from ast_sim.importers.formats.declared_sizes import (
     declared_in_vtkhdf,
     declared_in_xml,
@@ -36,6 +35,7 @@ from ast_sim.importers.formats.frd_results import read_frd_headers
 from ast_sim.importers.formats.source_mesh import SourceMesh
 from ast_sim.importers.formats.together import labels_of, together
 from ast_sim.importers.formats.vtk_cells import blocks_of
+from ast_sim.support.environment import of_child
 from ast_sim.support.errors import DatasetError, require
 
 READING_MODULE = "ast_sim.importers.formats.reading_worker"
@@ -218,14 +218,12 @@ class _Worker:
     def _running(self, path: Path) -> subprocess.Popen[bytes]:
         if self.process is None or self.owner != os.getpid() or self.process.poll() is not None:
             require("read", "vtkmodules")
-            root = str(Path(ast_sim.__file__).parent.parent)
-            search = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
             self.process = subprocess.Popen(
                 [sys.executable, "-P", "-m", READING_MODULE],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
-                env={**os.environ, "PYTHONPATH": search},
+                env=of_child(),
                 start_new_session=True,  # Ctrl-C is for this process alone
             )
             self.owner = os.getpid()

@@ -12,10 +12,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ast_sim import _C
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean, cofactor, determinant, von_mises
 from ast_sim.mechanics.linear_algebra.sparsity import Entries
+from ast_sim.support.environment import c_core
 from ast_sim.support.errors import SimulationError
+
+_C = c_core()
 
 FLATTEST = 0.2  # the least stretch that `upright` leaves
 

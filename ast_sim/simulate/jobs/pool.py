@@ -13,22 +13,16 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import ast_sim
 from ast_sim.simulate.jobs.manifest import Watch
 from ast_sim.simulate.jobs.samples import Recipe, Sample, sample_name
+from ast_sim.support.environment import SINGLE_THREAD, of_child
 from ast_sim.support.errors import SimulationError
 
 WORKER_MODULE = "ast_sim.simulate.jobs.worker"
 
-# One thread, and the same bits wherever an array lies in memory. Without MKL_CBWR, the alignment of an array changes
+# One thread and the same bits wherever an array lies in memory. Without MKL_CBWR, the alignment of an array changes
 # the order in which MKL sums. With a named branch (AVX2), processors with newer instructions give the same bits, too.
-ENVIRONMENT = {
-    "OMP_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    "MKL_NUM_THREADS": "1",
-    "MKL_THREADING_LAYER": "SEQUENTIAL",
-    "MKL_CBWR": "AVX2",
-}
+SAME_BITS = {"MKL_THREADING_LAYER": "SEQUENTIAL", "MKL_CBWR": "AVX2"}
 
 
 class Process:
@@ -41,13 +35,11 @@ class Process:
 
     def __init__(self, module: str, *arguments: str) -> None:
         # Not multiprocessing: its spawned children import the parent's script again, and torch with it.
-        root = str(Path(ast_sim.__file__).parent.parent)
-        path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
         self.process = subprocess.Popen(
             [sys.executable, "-P", "-m", module, *arguments, str(os.getpid())],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            env={**os.environ, **ENVIRONMENT, "PYTHONPATH": path},
+            env=of_child(**SINGLE_THREAD, **SAME_BITS),
             bufsize=0,
             start_new_session=True,  # an interrupt from the terminal reaches only the parent
         )

@@ -19,6 +19,7 @@ import torch
 
 from ast_sim.dataset.reader import Dataset
 from ast_sim.runs.train_config import RunConfig
+from ast_sim.support.environment import of_child
 from ast_sim.support.errors import RESUME, ConfigError, TrainingError
 from ast_sim.support.toml_settings import require_range
 
@@ -149,8 +150,8 @@ class _Helper:
         stack.callback(self._errors.close)
         # In a session of its own, so that Ctrl-C reaches the leading process alone, which tells the others.
         self.process = subprocess.Popen(
-            [sys.executable, "-c", _ALONG],
-            env={**os.environ, **environment},
+            [sys.executable, "-P", "-c", _ALONG],
+            env=of_child(**environment),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._errors,

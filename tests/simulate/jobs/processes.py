@@ -16,7 +16,7 @@ ROOT = pathlib.Path(ast_sim.__file__).parent.parent
 def environment(pause: str = "", mark: pathlib.Path | None = None, **changes: str) -> dict[str, str]:
     """Variables of a process; with a mark it, or one that it starts, stops at the moment `pause` (sitecustomize.py)."""
     path = os.pathsep.join([str(HERE), str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
-    marks = {} if mark is None else {"AST_SIM_TEST_PAUSE": pause, "AST_SIM_TEST_MARK": str(mark)}
+    marks = {} if mark is None else {"AST_TEST_PAUSE": pause, "AST_TEST_MARK": str(mark)}
     return {**os.environ, "PYTHONPATH": path, **marks, **changes}
 
 

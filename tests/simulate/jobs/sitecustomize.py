@@ -1,6 +1,6 @@
 """Runs when Python starts with this folder in PYTHONPATH: stops a generator at a chosen moment, to be killed there.
 
-AST_SIM_TEST_PAUSE names the moment and AST_SIM_TEST_MARK a file. The first process that comes to the moment writes its
+AST_TEST_PAUSE names the moment and AST_TEST_MARK a file. The first process that comes to the moment writes its
 number there and sleeps. Checkpoints are written at every frame, and a file "resumed" tells that one was continued.
 """
 
@@ -9,7 +9,7 @@ import os
 import time
 from pathlib import Path
 
-PAUSE, MARK = os.environ.get("AST_SIM_TEST_PAUSE", ""), Path(os.environ.get("AST_SIM_TEST_MARK", ""))
+PAUSE, MARK = os.environ.get("AST_TEST_PAUSE", ""), Path(os.environ.get("AST_TEST_MARK", ""))
 
 
 def pausing(owner, name: str, moment: str, call: int = 1, after: bool = False) -> None:

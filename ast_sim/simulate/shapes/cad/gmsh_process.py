@@ -11,20 +11,17 @@ import functools
 import importlib.util
 import io
 import json
-import os
 import signal
 import subprocess
 import sys
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-import ast_sim
 from ast_sim.simulate.shapes.parts import Part, oriented
+from ast_sim.support.environment import SINGLE_THREAD, of_child
 from ast_sim.support.errors import MissingExtra, SimulationError
 
-SINGLE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 MESHING_MODULE = "ast_sim.simulate.shapes.cad.cad_worker"
 WORKER = [sys.executable, "-P", "-m", MESHING_MODULE]
 START_SECONDS = 60  # limit on the processor time in which gmsh starts and builds the geometry
@@ -129,15 +126,13 @@ def _past_crashes(requests: list[dict[str, Any]]) -> dict[str, np.ndarray]:
 
 
 def _ask(request: dict[str, Any], seconds: int) -> dict[str, np.ndarray]:
-    root = str(Path(ast_sim.__file__).parent.parent)
-    path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
     try:
         done = subprocess.run(
             WORKER,
             input=json.dumps({**request, "seconds": seconds}).encode(),
             capture_output=True,
             timeout=PATIENCE * seconds,
-            env={**os.environ, **dict.fromkeys(SINGLE_THREAD, "1"), "PYTHONPATH": path},
+            env=of_child(**SINGLE_THREAD),
         )
     except subprocess.TimeoutExpired:
         raise SimulationError(f"gmsh did not answer within {PATIENCE * seconds} s and was stopped") from None
