@@ -56,6 +56,22 @@ _AT_CORNERS = ((0, 4, 6, 7), (4, 1, 5, 8), (6, 5, 2, 9), (7, 8, 9, 3))
 _EIGHTH = (*_AT_CORNERS, (4, 9, 6, 7), (4, 9, 5, 6), (4, 9, 8, 5), (4, 9, 7, 8))
 
 
+def _slopes(weights: np.ndarray) -> np.ndarray:
+    """[n, 10, 3] the derivatives of the shape functions by the coordinates of corners 1, 2 and 3."""
+    by_corner = np.zeros((len(weights), 10, 4))
+    by_corner[:, range(4), range(4)] = 4 * weights - 1
+    for node, (a, b) in enumerate(MIDDLES, 4):
+        by_corner[:, node, a], by_corner[:, node, b] = 4 * weights[:, b], 4 * weights[:, a]
+    return by_corner[:, :, 1:] - by_corner[:, :, :1]
+
+
+# The points of a second-order tetrahedron at which forces are integrated, by Gauss's rule of degree 2: barycentric
+# coordinates [point, corner]; each point has a quarter of the volume.
+_FAR, _NEAR = (5 - 5**0.5) / 20, (5 + 3 * 5**0.5) / 20
+POINTS = np.full((4, 4), _FAR) + (_NEAR - _FAR) * np.eye(4)
+SLOPES = _slopes(POINTS)  # [point, node, 3]
+
+
 def linear_elements(elements: np.ndarray) -> np.ndarray:
     """The elements [E,3] or [E,4] as they are; second-order ones [E,10] cut into [8 E,4], element by element."""
     return elements[:, np.array(_EIGHTH)].reshape(-1, 4) if elements.shape[1] == 10 else elements
@@ -111,6 +127,15 @@ def signed_volumes(points: np.ndarray, elements: np.ndarray) -> np.ndarray:
         six = ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx)
         volumes[first : first + _BLOCK] = six / 6
     return volumes
+
+
+def point_volumes(points: np.ndarray, elements: np.ndarray) -> np.ndarray:
+    """[1, E] the volumes of tetrahedra [E, 4], or [4, E] the shares of the points in second-order ones [E, 10], in
+    float64; negative where an element is inside out."""
+    if elements.shape[1] == 4:
+        return signed_volumes(points, elements)[None]
+    places = points.astype(np.float64)[elements]  # [E, 10, 3]
+    return np.stack([np.linalg.det(np.einsum("eai,ak->eik", places, slopes)) / 24 for slopes in SLOPES])
 
 
 def surface_triangles(position: np.ndarray, elements: np.ndarray) -> np.ndarray:

@@ -13,8 +13,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ast_sim.element_topology import SLOPES
 from ast_sim.material import ELASTIC, Material
-from ast_sim.mechanics.elements.second_order import LARGEST, SLOPES
+from ast_sim.mechanics.elements.second_order import LARGEST
 from ast_sim.ops import TetrahedronSet, elastic_forces, join_indices
 from ast_sim.scene import Scene
 from ast_sim.support.errors import DatasetError

@@ -49,7 +49,8 @@ def _describe_split(
         trajectory = dataset.load(split, index)
         scene = trajectory.scene
         name = f"{split}/{index:06d}"
-        findings += [(name, one) for one in (*in_trajectory(trajectory), *across.look(name, trajectory))]
+        looked = *in_trajectory(trajectory, dataset.info.integration == "dynamic"), *across.look(name, trajectory)
+        findings += [(name, one) for one in looked]
         sizes.append((scene.num_nodes, scene.num_elements, trajectory.num_frames))
         for kind in NodeType:
             types[kind.name] += int((scene.node_type == kind).sum())
@@ -64,7 +65,8 @@ def _describe_split(
             largest = max(largest, float(np.linalg.norm(moved, axis=1).max()))
         for name, one in dataset.fields(split, index).items():
             fields[name] = f"{_field(one.values)} at each {one.location}, {one.unit or 'no unit'}"
-        arrays = {**vars(scene), "position": trajectory.position, "stress": trajectory.stress}
+        arrays = {one.name: getattr(scene, one.name) for one in dataclasses.fields(scene)}
+        arrays |= {"position": trajectory.position, "stress": trajectory.stress}
         fields |= {name: _field(array) for name, array in arrays.items() if array is not None}
         for frame in range(trajectory.num_frames):  # one frame at a time saves memory: six numbers per element
             tensor = dataset.cauchy_stress(split, index, frame, frame + 1)

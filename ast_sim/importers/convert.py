@@ -117,7 +117,8 @@ def convert_series(
     with FittedWriter(out, **facts) as writer, Progress(len(chosen), "simulations", progress) as bar:
         for split, name, trajectory in _trajectories(series, decks, chosen, names, corners, incomplete, integration):
             _agree(writer, made_by, series[name], trajectory)
-            findings += [(name, one) for one in (*in_trajectory(trajectory), *across.look(name, trajectory))]
+            looked = *in_trajectory(trajectory, integration == "dynamic"), *across.look(name, trajectory)
+            findings += [(name, one) for one in looked]
             writer.add(split, trajectory)
             bar.advance(_line(split, name, trajectory))
         findings += across.all_together()

@@ -1,5 +1,5 @@
 """What looks wrong in the frames of a simulation: tools that change their shape, displacements in other units, elements
-that turn over, frames that repeat, bodies that change their places, displacements from the frame before, no motion,
+that turn over, frames that stop dead, bodies that change their places, displacements from the frame before, no motion,
 Poisson's ratios, yield stresses and stresses that cannot be one, contact that no model can see.
 
 Legend: S frames, N nodes, E elements.
@@ -42,8 +42,8 @@ _OVERSHOOT = 0.05
 _FRAMES = 5
 
 
-def in_trajectory(trajectory: Trajectory) -> list[Finding]:
-    """What looks wrong in a simulation."""
+def in_trajectory(trajectory: Trajectory, dynamic: bool = False) -> list[Finding]:
+    """What looks wrong in a simulation. What the bundled solver makes has nothing of it."""
     scene, position = trajectory.scene, trajectory.position
     findings = [
         *at_rest(scene),
@@ -53,7 +53,9 @@ def in_trajectory(trajectory: Trajectory) -> list[Finding]:
         *_far(scene, position),
         *_soft_tools(scene, position),
     ]
-    findings += [*_turn_over(scene, position), *_repeats(position, trajectory.stress)]
+    findings += _turn_over(scene, position)
+    if dynamic:  # else a frame is the one before once more wherever all prescribed nodes hold still
+        findings += _stops_dead(position)
     findings += _negative_stress(trajectory)
     findings += [*change_places(scene, position), *counted_from_frame_before(scene, position)]
     return [*findings, *_contact(scene, position)]
@@ -102,10 +104,8 @@ def _far(scene: Scene, position: np.ndarray) -> list[Finding]:
     if not len(rows):
         return []
     where = places("frames", rows)
-    meaning = (
-        f"nodes move by {largest.max():.3g}, {largest.max() / size:.3g} times the size of the scene: are displacement"
-        " and mesh in one unit?"
-    )
+    beside = f"{largest.max() / size:.3g} times the size of the scene" if size else "from one point"
+    meaning = f"nodes move by {largest.max():.3g}, {beside}: are displacement and mesh in one unit?"
     return [Finding("frames with very large displacements", len(rows), where, meaning)]
 
 
@@ -143,15 +143,13 @@ def _turn_over(scene: Scene, position: np.ndarray) -> list[Finding]:
     return [Finding("elements that turn over", count, first or "", meaning)]
 
 
-def _repeats(position: np.ndarray, stress: np.ndarray | None) -> list[Finding]:
+def _stops_dead(position: np.ndarray) -> list[Finding]:
+    """Frames with the positions of the frame before, which had moved: with inertia nothing stops at once."""
     same = (position[1:] == position[:-1]).all(axis=(1, 2))
-    if stress is not None:
-        same &= (stress[1:] == stress[:-1]).all(axis=(1, 2))
-    rows = 1 + np.flatnonzero(same)
-    moves = len(position) > 1 and not (position == position[0]).all()
-    if not len(rows) or not moves:
+    rows = 2 + np.flatnonzero(same[1:] & ~same[:-1])
+    if not len(rows):
         return []
-    meaning = "each is the frame before it once more: does all hold still, or was it written twice?"
+    meaning = "each is the frame before it once more, but inertia does not stop at once: was it written twice?"
     return [Finding("frames that repeat", len(rows), places("frames", rows), meaning)]
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ast_sim.element_topology import LOCAL_FACES, equal_rows, linear_elements, signed_volumes
+from ast_sim.element_topology import LOCAL_FACES, equal_rows, point_volumes
 from ast_sim.number_arrays import connected_parts
 from ast_sim.plausibility.findings import Finding, places
 from ast_sim.plausibility.overlaps import overlaps
@@ -65,8 +65,10 @@ def _single_elements(scene: Scene) -> list[Finding]:
 
 
 def _inside_out(scene: Scene) -> list[Finding]:
-    volumes = signed_volumes(scene.rest_position, linear_elements(scene.elements)).reshape(scene.num_elements, -1)
-    rows = np.flatnonzero((volumes <= 0).any(axis=1))
+    """Elements that have no volume where forces are integrated. In second-order ones a piece between nodes and curved
+    edges may be inside out all the same."""
+    volumes = point_volumes(scene.rest_position, scene.elements)
+    rows = np.flatnonzero((volumes <= 0).any(axis=0))
     meaning = "the order of their nodes is another one, or they are flat: they cannot be computed with"
     return [Finding("elements inside out", len(rows), _elements(scene, rows), meaning)] if len(rows) else []
 
@@ -98,6 +100,8 @@ def _faces_on_faces(scene: Scene) -> list[Finding]:
 
     surface = scene.surface()
     nodes = np.unique(surface)
+    if not len(nodes):  # each face has two elements, as where all lie on each other
+        return []
     points = scene.rest_position[nodes].astype(np.float64)
     distance = _SAME_PLACE * float(np.ptp(points, axis=0).max())
     pairs = KDTree(points).query_pairs(distance, output_type="ndarray")

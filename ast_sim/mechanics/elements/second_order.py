@@ -17,15 +17,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from ast_sim.element_topology import MIDDLES
+from ast_sim.element_topology import MIDDLES, POINTS, SLOPES
 from ast_sim.mechanics.elements.elasticity import Deformation, Elasticity, stiffness
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean, cofactor, determinant, von_mises
 from ast_sim.support.errors import SimulationError
 
 LARGEST = 20.0
-# Gauss's rule of degree 2: barycentric coordinates [point, corner]; each point has a quarter of the volume.
-_FAR, _NEAR = (5 - 5**0.5) / 20, (5 + 3 * 5**0.5) / 20
-POINTS = np.full((4, 4), _FAR) + (_NEAR - _FAR) * np.eye(4)
 
 
 def shape_functions(weights: np.ndarray) -> np.ndarray:
@@ -35,15 +32,6 @@ def shape_functions(weights: np.ndarray) -> np.ndarray:
     return np.concatenate([corners, np.stack(middles, axis=1)], axis=1)
 
 
-def _slopes(weights: np.ndarray) -> np.ndarray:
-    """[n, 10, 3] the derivatives of the shape functions by the coordinates of corners 1, 2 and 3."""
-    by_corner = np.zeros((len(weights), 10, 4))
-    by_corner[:, range(4), range(4)] = 4 * weights - 1
-    for node, (a, b) in enumerate(MIDDLES, 4):
-        by_corner[:, node, a], by_corner[:, node, b] = 4 * weights[:, b], 4 * weights[:, a]
-    return by_corner[:, :, 1:] - by_corner[:, :, :1]
-
-
 def _extrapolation() -> np.ndarray:
     """[10, 4] values at the nodes of the linear function with given values at the points."""
     at_corners = np.linalg.inv(POINTS)
@@ -51,7 +39,6 @@ def _extrapolation() -> np.ndarray:
 
 
 _EXTRAPOLATION = _extrapolation()
-SLOPES = _slopes(POINTS)  # [point, node, 3]
 
 
 def points_at_rest(rest: np.ndarray, elements: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
