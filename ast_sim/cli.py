@@ -6,6 +6,7 @@ An error that a user can act on is printed as one line on stderr, and the exit c
 from __future__ import annotations
 
 import argparse
+import contextlib
 import io
 import os
 import shlex
@@ -19,7 +20,6 @@ from ast_sim import __version__
 from ast_sim.command_line import commands, help_lines, judging_commands, planning_commands
 from ast_sim.command_line.effort_options import add_effort
 from ast_sim.support.argument_types import (
-    Once,
     Parser,
     add_each,
     add_out,
@@ -42,10 +42,14 @@ def main(argv: list[str] | None = None) -> int:
         return 2
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # names of files may hold bytes that are no text
-    args = build_parser().parse_args(argv)
-    args.command_line = shlex.join(["ast-sim", *(sys.argv[1:] if argv is None else argv)])
+    if sys.stderr is None:
+        sys.stderr = open(os.devnull, "w")  # noqa: SIM115, until the process ends
+    words = sys.argv[1:] if argv is None else argv
+    args = argparse.Namespace(command=None, debug=False)
     warnings.showwarning = lambda message, category, *_: _show(message, category)
     try:
+        build_parser().read(words, args)
+        args.command_line = shlex.join(["ast-sim", *words])
         check_variables()
         args.run(args)
         sys.stdout.flush()
@@ -53,19 +57,29 @@ def main(argv: list[str] | None = None) -> int:
     except KeyboardInterrupt as error:
         return 128 + (error.number if isinstance(error, Interrupted) else signal.SIGINT)
     except (BrokenPipeError, SystemExit) as error:
-        try:
-            sys.stdout.flush()
-        except OSError:
-            # The reader is gone. Redirect stdout, so that Python's flush at exit does not fail, too.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        if isinstance(error, SystemExit):
+        lost = _flush()
+        if isinstance(error, SystemExit) and (lost is None or error.code):
             raise
-        return 141
-    except (AstSimError, OSError) as error:
+        if isinstance(lost or error, BrokenPipeError):
+            return 141
+        _tell("ast-sim", lost)
+        return 2
+    except (AstSimError, OSError, Warning) as error:  # a warning under PYTHONWARNINGS=error
         if args.debug:
             raise
-        _tell(f"ast-sim {args.command}", error)
+        _tell(f"ast-sim {args.command or ''}".rstrip(), error)
         return 2
+
+
+def _flush() -> OSError | None:
+    """Write what standard output still holds; the error if it cannot be written, as where a reader is gone."""
+    try:
+        sys.stdout.flush()
+    except OSError as error:
+        # Redirect it, so that Python's flush at exit does not fail, too.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return error
+    return None
 
 
 def _show(message: object, category: type[Warning]) -> None:
@@ -77,10 +91,11 @@ def _show(message: object, category: type[Warning]) -> None:
 
 
 def _tell(what: str, message: object) -> None:
-    print(f"{what}: {printable(' '.join(str(message).split()))}", file=sys.stderr)
+    with contextlib.suppress(OSError):  # nobody can be told that a line on stderr is lost
+        print(f"{what}: {printable(' '.join(str(message).split()))}", file=sys.stderr)
 
 
-def build_parser() -> argparse.ArgumentParser:
+def build_parser() -> Parser:
     """The parser of all commands."""
     parser = Parser(prog="ast-sim", description="Learned simulation of deforming bodies in contact.")
     parser.add_argument("--version", action="version", version=f"ast_sim {__version__}")
@@ -169,7 +184,7 @@ def _add_convert(convert: Parser) -> None:
         "--handle NAME": "the same for prescribed nodes of deforming bodies; a place is written BODY:PLACE, as 0:zmin",
         "--body NAME": "point or cell field with the numbers of the bodies",
     }
-    add_each(fields, names, action=Once)
+    add_each(fields, names)
     about = "components of the stress, such as xx,xy,xz,yy,yz,zz (default: as the file names them, else xx,yy,zz,...)"
     add_each(
         fields, {"--stress-order XX,YY,...": about}, type=read_by("ast_sim.importers.stress:parse_order"), default=()
@@ -179,7 +194,7 @@ def _add_convert(convert: Parser) -> None:
     about = "a further field that the dataset keeps by its name, such as PEEQ or CPRESS=MPa; may be repeated"
     add_each(fields, {"--field NAME[=UNIT]": about}, action="append", default=[])
     about = "point field with the forces on the nodes, such as RF, in newton (in the unit of force of a deck)"
-    add_each(fields, {"--reaction NAME": about}, action=Once)
+    add_each(fields, {"--reaction NAME": about})
     kind = convert.add_argument_group("properties of a dataset made from such files")
     about = "shares of the simulations, drawn at random (default: 0.8 0.1 0.1 of three or more)"
     kind.add_argument("--shares", nargs=3, type=float, metavar=("TRAIN", "VALID", "TEST"), help=about)

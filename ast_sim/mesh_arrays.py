@@ -13,6 +13,7 @@ from ast_sim.element_topology import CELL_KINDS
 from ast_sim.number_arrays import (
     connected_parts,
     nodes_of_body,
+    plain_array,
     real_numbers,
     require_array,
     require_nodes,
@@ -69,7 +70,7 @@ def scene_arrays(
 
 def _nodes(name: str, handles: Any, count: int) -> np.ndarray:
     """The numbers of the nodes, from numbers or from a mask [N]."""
-    nodes = np.asarray(handles)
+    nodes = plain_array(name, "handles", handles)
     if not nodes.ndim:
         raise ConfigError(f"handles is {in_short(handles)}; it must be a list of nodes, or True or False for each")
     if nodes.dtype == bool:
@@ -98,12 +99,16 @@ def joined_arrays(given: Sequence[Any]) -> dict[str, Any]:
     columns: dict[str, list[Any]] = {key: [] for key in keys}
     first_node = first_body = 0
     for scene in scenes:
-        shifted = {**scene, "elements": scene["elements"] + np.int32(first_node)}
-        shifted["body"] = scene["body"] + np.int32(first_body)
+        bodies = scene["body"].astype(np.int64) + first_body
+        if bodies.max() > np.iinfo(np.int32).max:
+            raise DatasetError(
+                f"the scenes to join would have a body {bodies.max()}, which is too large: number them from 0"
+            )
+        shifted = {**scene, "elements": scene["elements"] + np.int32(first_node), "body": bodies.astype(np.int32)}
         for key in keys:
             columns[key].append(shifted[key])
         first_node += len(scene["rest_position"])
-        first_body = int(shifted["body"].max()) + 1
+        first_body = int(bodies.max()) + 1
     return {key: None if parts[0] is None else np.concatenate(parts) for key, parts in columns.items()}
 
 
@@ -140,9 +145,9 @@ def mesh_of_arrays(
     )
 
 
-def require_mesh(name: str, elements: np.ndarray, node_type: np.ndarray) -> None:
-    """Raise DatasetError if an element refers to a node twice, or if the type of a node is no `NodeType`; the text
-    names `name` and the first one."""
+def require_mesh(name: str, elements: np.ndarray, node_type: np.ndarray, body: np.ndarray) -> None:
+    """Raise DatasetError if an element refers to a node twice, if the type of a node is no `NodeType`, or if a body has
+    a number below 0; the text names `name` and the first one."""
     pairs = combinations(range(elements.shape[1]), 2)
     repeated = np.logical_or.reduce([elements[:, a] == elements[:, b] for a, b in pairs])
     if repeated.any():
@@ -153,3 +158,6 @@ def require_mesh(name: str, elements: np.ndarray, node_type: np.ndarray) -> None
         node = int(np.argmax(unknown))
         known = ", ".join(f"{kind.value} {kind.name}" for kind in NodeType)
         raise DatasetError(f"{name}: node {node} has the type {node_type[node]}; known are {known}")
+    if (body < 0).any():
+        node = int(np.argmax(body < 0))
+        raise DatasetError(f"{name}: node {node} is of the body {body[node]}, but bodies are numbered from 0")

@@ -23,7 +23,7 @@ def real_numbers(name: str, array: str, value: Any) -> np.ndarray:
     Raises:
         DatasetError: these are no numbers, or a finite one is too large for float32; the text names `name` and `array`.
     """
-    given = _as_array(name, array, value)
+    given = plain_array(name, array, value)
     if given.dtype.kind not in "fiu":
         raise DatasetError(f"{name}: {array} must be numbers, not {given.dtype}")
     with np.errstate(over="ignore", under="ignore"):
@@ -52,7 +52,7 @@ def whole_numbers(name: str, array: str, value: Any, dtype: type) -> np.ndarray:
     Raises:
         DatasetError: one is not whole, or does not fit into the type; the text names `name`, `array` and the number.
     """
-    given = _as_array(name, array, value)
+    given = plain_array(name, array, value)
     if given.dtype.kind not in "fiu":
         raise DatasetError(f"{name}: {array} must be whole numbers, not {given.dtype}")
     limits = np.iinfo(dtype)
@@ -65,7 +65,12 @@ def whole_numbers(name: str, array: str, value: Any, dtype: type) -> np.ndarray:
     return np.array(given, dtype, order="C")
 
 
-def _as_array(name: str, array: str, value: Any) -> np.ndarray:
+def plain_array(name: str, array: str, value: Any) -> np.ndarray:
+    """An array of NumPy, from one or from lists.
+
+    Raises:
+        DatasetError: these are rows of different lengths, masked numbers or a tensor of torch with gradients.
+    """
     if isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value):
         raise DatasetError(f"{name}: {array} has masked numbers: fill them, or leave out what they belong to")
     try:
@@ -181,7 +186,7 @@ def ranges(numbers: Iterable[int]) -> str:
 
 def percent(share: float, digits: int = 2) -> str:
     """A share as text, "1.2 %" or "100 %", never with an exponent."""
-    rounded = f"{100 * share:.{digits}g}"
+    rounded = f"{100 * float(share):.{digits}g}"
     return f"{Decimal(rounded):f} %" if math.isfinite(share) else f"{rounded} %"
 
 

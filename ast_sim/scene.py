@@ -180,7 +180,7 @@ class Scene(ReadOnlyArrays):
                 raise DatasetError(f"{name}: material has no columns; leave it out (None)")
             require_finite(name, "material", "element", self.material)
         require_nodes(name, "element", self.elements, n)
-        require_mesh(name, self.elements, self.node_type)
+        require_mesh(name, self.elements, self.node_type, self.body)
 
     def require_predictable(self, name: str) -> None:
         """Raise DatasetError if no node is free, or if the deforming bodies have no extent; the text names `name`."""

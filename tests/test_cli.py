@@ -3,9 +3,11 @@
 import json
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import h5py
@@ -14,6 +16,7 @@ import pytest
 import toy
 from data_samples import sign
 
+import ast_sim
 from ast_sim.cli import build_parser, main
 from ast_sim.dataset.reader import Dataset
 from ast_sim.support.errors import AstSimError
@@ -619,3 +622,47 @@ def test_names_that_are_not_utf_8(trained, tmp_path, capsys):
     assert "cannot hold a name that is not UTF-8" in fails(capsys, "predict", run, data, "--index", 0, "--out", pvd)
     assert not pvd.exists() and not pvd.with_suffix("").exists()
     assert r"absent\udce9.h5" in fails(capsys, "info", folder / os.fsdecode(b"absent\xe9.h5"))
+
+
+@pytest.mark.parametrize("buffered", [True, False])
+@pytest.mark.parametrize("words", [["--help"], ["--version"], ["train", "--help"]])
+def test_a_help_that_cannot_be_written_is_an_error(words, buffered):
+    environment = {**os.environ, "PYTHONUNBUFFERED": "" if buffered else "1"}
+    command = [sys.executable, "-m", "ast_sim.cli", *words]
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, env=environment)
+    name = " ".join(["ast-sim", *words[:-1]])
+    assert (done.returncode, done.stderr) == (2, f"{name}: [Errno 28] No space left on device\n")
+
+
+@pytest.mark.parametrize("redirect", ["2>/dev/full", "2>&-"])
+def test_a_warning_that_nobody_can_read_ends_nothing(trained, tmp_path, redirect):
+    """This question warns: a toy is no plate."""
+    run = Path(ast_sim.__file__).parent / "example_runs/plates.ast"
+    words = [
+        sys.executable,
+        "-m",
+        "ast_sim.cli",
+        "predict",
+        run,
+        trained[0],
+        "--index",
+        "0",
+        "--out",
+        tmp_path / "o.h5",
+    ]
+    asked = shlex.join(map(str, words))
+    assert "warning: " in subprocess.run(["sh", "-c", asked], capture_output=True, text=True).stderr
+    (tmp_path / "o.h5").unlink()
+    done = subprocess.run(["sh", "-c", f"{asked} {redirect}"], stdout=subprocess.PIPE, text=True)
+    assert done.returncode == 0 and done.stdout.startswith(f"{tmp_path}/o.h5: 6 frames predicted")
+    with Dataset(tmp_path / "o.h5") as answer:
+        assert answer["test"][0].num_frames == 7
+
+
+def test_warnings_as_errors_are_one_line(trained, tmp_path):
+    run = Path(ast_sim.__file__).parent / "example_runs/plates.ast"
+    words = ["predict", run, trained[0], "--index", "0", "--out", tmp_path / "o.h5"]
+    with warnings.catch_warnings(action="error"):
+        assert main([str(word) for word in words]) == 2
+    assert not (tmp_path / "o.h5").exists()

@@ -88,6 +88,11 @@ USUAL = {  # what a user may well give, by the name that the parser has for it
 }  # fmt: skip
 
 
+def commands() -> argparse._SubParsersAction:
+    (sub,) = (action for action in build_parser()._actions if isinstance(action, argparse._SubParsersAction))
+    return sub
+
+
 def keys() -> list[str]:
     """The names of all settings of all models."""
     of_models = [f"model.{s.key}" for name in model_names() for s in toml_settings.settings(find_model(name).config)]
@@ -116,7 +121,7 @@ def value(command: str, action: argparse.Action) -> st.SearchStrategy[str]:
 def command_line(draw: st.DrawFn) -> list[str]:
     """A command with its arguments and up to three options, each with some value; now and then an argument is missing,
     or there is a word more."""
-    parsers = next(a for a in build_parser()._actions if isinstance(a, argparse._SubParsersAction)).choices
+    parsers = commands().choices
     name = draw(st.sampled_from(sorted(parsers)))
     usual, options = [], []
     for action in parsers[name]._actions:
@@ -206,3 +211,42 @@ def test_no_command_line_ends_in_a_traceback(files, no_long_work, tmp_path, monk
     run()
     print(ends)
     assert {name for name, _ in ends} == COMMANDS and {code for _, code in ends} == {0, 2}
+
+
+VALUES = {"--stress-order": "xx,yy,zz,xy,yz,xz", "--num-frames": "2"}  # where 1 is none
+
+
+def options(command: str) -> list[argparse.Action]:
+    """The options of a command that take one value."""
+    chosen = commands().choices[command]._actions
+    return [one for one in chosen if one.option_strings and one.nargs is None and one.default != []]
+
+
+COMMANDS = [
+    "demo",
+    "generate",
+    "convert",
+    "info",
+    "train",
+    "predict",
+    "sweep",
+    "plan",
+    "evaluate",
+    "calibrate",
+    "trade",
+    "report",
+]
+
+
+@pytest.mark.parametrize("command", sorted(commands().choices))
+def test_an_option_that_takes_one_value_is_given_once(command, capsys):
+    """The last of two was taken, and the first did nothing."""
+    for option in options(command):
+        name = option.option_strings[0]
+        value = option.choices[0] if option.choices else VALUES.get(name, "1")
+        with pytest.raises(SystemExit, match="^2$"):
+            main([command, "x", f"{name}={value}", name, str(value)])
+        assert f"ast-sim {command}: {name} is given twice: leave one out (see " in capsys.readouterr().err
+        with pytest.raises(SystemExit, match="^2$"):
+            main([command, "x", f"{name}=--"])
+        assert capsys.readouterr().err == f"ast-sim: {name}=--: -- is no value (see ast-sim --help)\n"

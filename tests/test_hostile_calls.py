@@ -7,6 +7,9 @@ import re
 import resource
 import shutil
 import signal
+import warnings
+from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +19,7 @@ import toy
 from meshes import plate_and_punch
 
 import ast_sim
-from ast_sim import Effort
+from ast_sim import Effort, Scene
 from ast_sim.inference.trade import Trade
 from ast_sim.support.argument_checks import at_home, require_line
 from ast_sim.support.disk import output_file
@@ -117,8 +120,13 @@ def test_numbers_of_frames(plates, scene):
 
 def test_a_time_limit_of_any_size(plates, scene):
     kind = {"num_frames": 2, "frames": -1}
-    chosen = {plates.predict(scene, PRESS, ms=ms, **kind).source["effort"] for ms in (1e300, float("inf"), 10**400)}
+    limits = (1e300, float("inf"), 10**400, np.float32(1e30), Fraction(10**400), Fraction(10**6, 3))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)  # of NumPy, where a number is too large for its type
+        chosen = {plates.predict(scene, PRESS, ms=ms, **kind).source["effort"] for ms in limits}
     assert len(chosen) == 1
+    taken = [plates.predict(scene, PRESS, error=error, **kind).source for error in (0.05, Fraction(1, 20))]
+    assert taken[0]["promise"] == taken[1]["promise"] and "5 % of the displacement" in taken[0]["promise"]
     with pytest.raises(ConfigError, match="the error of the displacement is 1000.*; it must lie") as error:
         plates.predict(scene, PRESS, error=10**400)
     assert len(str(error.value)) < 200
@@ -240,6 +248,23 @@ def test_a_full_disk_leaves_no_file(plates, scene, tmp_path, suffix):
         signal.signal(signal.SIGXFSZ, handler)
     answer.save(tmp_path / f"a{suffix}")
     assert (tmp_path / f"a{suffix}").stat().st_size > 100
+
+
+def test_bodies_have_any_numbers_and_nodes_need_no_element(plates, scene):
+    """The answer is the one to bodies 0 and 1; a node of no element is a body that touches nothing."""
+    plain = plates.predict(scene, PRESS, num_frames=2)
+    names = np.array([7, 10**9], np.int32)
+    renamed = plates.predict(replace(scene, body=names[scene.body]), {10**9: PRESS[1]}, num_frames=2)
+    assert np.array_equal(renamed.position, plain.position) and np.array_equal(renamed.reaction(), plain.reaction())
+    handle = np.array([ast_sim.NodeType.HANDLE], np.uint8)
+    loose = Scene.of(
+        np.concatenate([scene.rest_position, [[0, 0.1, 0.1]]]),
+        scene.elements,
+        node_type=np.concatenate([scene.node_type, handle]),
+        body=np.append(scene.body, 2),
+    )
+    answer = plates.predict(loose, PRESS, num_frames=2, effort=Effort(newton_steps=1))
+    assert np.isfinite(answer.reaction()).all() and answer.reaction()[1, 2] < 0
 
 
 def test_bodies_that_would_not_be_what_was_asked_for():

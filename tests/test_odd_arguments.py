@@ -24,6 +24,16 @@ POINTS, CELLS = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 1, 2, 3]]
 NO_NAME = "must be the name of a file or a folder"
 
 
+class Place:
+    """A path of a class of one's own."""
+
+    def __init__(self, name) -> None:
+        self.name = name
+
+    def __fspath__(self):
+        return self.name
+
+
 def refused(call, text: str) -> None:
     """The call ends with an error of ours, in one line that holds the text."""
     with pytest.raises(AstSimError, match=re.escape(text)) as error:
@@ -53,7 +63,9 @@ def answer(run, scene):
 
 
 def test_the_checks_by_hand(tmp_path):
-    assert file_name("a", "x") == file_name(Path("a"), "x") == Path("a")
+    assert file_name("a", "x") == file_name(Path("a"), "x") == file_name("\udcff", "x").with_name("a") == Path("a")
+    for wrong in (b"a", Place(b"a"), Place(5), "\ud800", "", "a\0", 5, None):
+        refused(lambda wrong=wrong: file_name(wrong, "x"), NO_NAME)
     assert several("x", (n for n in (1, 2)), "numbers") == several("x", np.array([1, 2]), "numbers") == [1, 2]
     assert in_short("a" * 99) == f"'{'a' * 49}..." and in_short(np.zeros((9, 9))) == "of the type ndarray"
     assert in_short(10**400) == f"1{'0' * 49}..." and in_short(Scene) == "the class Scene"
@@ -120,7 +132,8 @@ def test_what_is_no_motion(run, scene, motion, text):
         ({"stress": [[1, 2], [3]]}, "stress must be an array"),
         ({"throw": "no"}, "throw is 'no'; it must be True or False"),
         ({"name": 5}, "name is 5; it must be a text"),
-        ({"frames": {1: 2}}, "frames must be whole numbers, one such number, or a slice, not {1: 2}"),
+        ({"frames": np.ma.masked_array([1, 2], [True, False])}, "or a slice, not of the type MaskedArray"),
+        ({"frames": {1: 2}}, "frames must be whole numbers, one such number, or a slice, not of the type dict"),
         ({"progress": lambda: None}, "it must be True, False or a function of (done, total, text)"),
     ],
 )

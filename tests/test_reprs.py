@@ -39,6 +39,9 @@ def test_lines():
         f"Answer(name: <b>toy</b>, frames: 0, 3, nodes: 48, largest displacement: {moved:.4g} m,"
         f" largest stress: {TRUTH.stress[3].max():.4g} Pa, expected error: 2.5 %, converged: yes, seconds: 0.5)"
     )
+    coloured = replace(answer(), name="\x1b[31m<i>\udc80\n")
+    assert repr(coloured).startswith("Answer(name: \\x1b[31m<i>\\udc80\\n, frames")
+    assert "\\x1b[31m&lt;i&gt;\\udc80\\n</td>" in coloured._repr_html_()
     failed = answer(failure="too far", info=None)
     assert "expected error: not known, converged: no Newton steps" in repr(failed)
     assert repr(failed).endswith("failure: too far)")

@@ -67,6 +67,9 @@ def test_points_in_the_plane_get_a_third_coordinate():
         ({"material": [[1.0]] * 3}, r"material has the shape \[3, 1\], must be \[2, any\]"),
         ({"handles": [9]}, "handle 0 refers to node 9, but the nodes are 0 to 7"),
         ({"handles": np.ones(3, bool)}, r"handles has the shape \[3\], must be \[8\]"),
+        ({"handles": np.ma.masked_array([True] * 8, [False] * 7 + [True])}, "handles has masked numbers"),
+        ({"handles": np.ma.masked_array([0, 1], [True, False])}, "handles has masked numbers"),
+        ({"body": [0] * 7 + [-1]}, "node 7 is of the body -1, but bodies are numbered from 0"),
     ],
 )
 def test_what_is_wrong_is_named(changes, text):
@@ -132,6 +135,10 @@ def test_joined_scenes_count_on():
         Scene.join(one, two_tetrahedra(material=np.ones((2, 1), np.float32)))
     with pytest.raises(DatasetError, match="here are: no scene"):
         Scene.join()
+    last = Scene.of(POINTS, CELLS, body=[2**31 - 1] * 8)
+    assert Scene.join(last).body.tolist() == [2**31 - 1] * 8
+    with pytest.raises(DatasetError, match="would have a body 4294967295, which is too large: number them from 0"):
+        Scene.join(last, last)
 
 
 def test_bodies_to_start_from_have_their_sizes():

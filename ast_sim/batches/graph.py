@@ -172,7 +172,8 @@ class Graph:
         """[N, F] -> [N, F] and [N, 1] float64: for each node the sum over the prescribed nodes of its body, and their
         number, at least 1."""
         scene = torch.arange(self.num_scenes).repeat_interleave(self.node_offsets.diff())
-        body = scene * (int(self.body.max()) + 1) + self.body
+        numbers = self.body.unique(return_inverse=True)[1]  # a scene may number its bodies as it likes
+        body = scene * (int(numbers.max()) + 1) + numbers
         counted = torch.cat([x.double(), torch.ones(len(x), 1)], dim=1) * self.prescribed[:, None]
         sums = counted.new_zeros(int(body.max()) + 1, counted.shape[1]).index_add_(0, body, counted)[body]
         return sums[:, :-1], sums[:, -1:].clamp(min=1)

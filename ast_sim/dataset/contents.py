@@ -11,7 +11,6 @@ import numpy as np
 from ast_sim.dataset.reader import Dataset
 from ast_sim.plausibility.across import AcrossSimulations
 from ast_sim.plausibility.findings import Finding, told
-from ast_sim.plausibility.motion import in_trajectory
 from ast_sim.scene import NodeType
 from ast_sim.support.errors import printable
 
@@ -20,7 +19,7 @@ def describe_dataset(path: Path) -> dict[str, Any]:
     """Counts, sizes, fields and units of a dataset; every trajectory is read and checked."""
     findings: list[tuple[str, Finding]] = []
     with Dataset(path) as dataset:
-        across = AcrossSimulations()
+        across = AcrossSimulations(dynamic=dataset.info.integration == "dynamic")
         filled = [split for split, count in dataset.splits.items() if count]
         splits = {split: _describe_split(dataset, split, findings, across) for split in filled}
         findings += across.all_together()
@@ -49,8 +48,7 @@ def _describe_split(
         trajectory = dataset.load(split, index)
         scene = trajectory.scene
         name = f"{split}/{index:06d}"
-        looked = *in_trajectory(trajectory, dataset.info.integration == "dynamic"), *across.look(name, trajectory)
-        findings += [(name, one) for one in looked]
+        findings += [(name, one) for one in across.look(name, trajectory)]
         sizes.append((scene.num_nodes, scene.num_elements, trajectory.num_frames))
         for kind in NodeType:
             types[kind.name] += int((scene.node_type == kind).sum())

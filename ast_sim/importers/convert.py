@@ -23,7 +23,6 @@ from ast_sim.importers.order_of_files.listed import SERIES
 from ast_sim.importers.series import FieldNames, read_series
 from ast_sim.plausibility.across import AcrossSimulations
 from ast_sim.plausibility.findings import Finding, refusal, told
-from ast_sim.plausibility.motion import in_trajectory
 from ast_sim.scene import Trajectory
 from ast_sim.support.argument_checks import file_name, require_bool, require_type, several
 from ast_sim.support.errors import ConfigError, DatasetError, LooksWrong, nearest_name, warn
@@ -113,12 +112,11 @@ def convert_series(
     facts: dict[str, Any] = {"family": source.stem, "integration": integration, "length_unit": length_unit or "m"}
     facts |= {"generator": made_by, "contact_radius": contact_radius, "time_step": time_step, "stress_location": "none"}
     findings: list[tuple[str, Finding]] = []
-    across = AcrossSimulations()
+    across = AcrossSimulations(dynamic=integration == "dynamic")
     with FittedWriter(out, **facts) as writer, Progress(len(chosen), "simulations", progress) as bar:
         for split, name, trajectory in _trajectories(series, decks, chosen, names, corners, incomplete, integration):
             _agree(writer, made_by, series[name], trajectory)
-            looked = *in_trajectory(trajectory, integration == "dynamic"), *across.look(name, trajectory)
-            findings += [(name, one) for one in looked]
+            findings += [(name, one) for one in across.look(name, trajectory)]
             writer.add(split, trajectory)
             bar.advance(_line(split, name, trajectory))
         findings += across.all_together()

@@ -16,14 +16,14 @@ from ast_sim.importers.scene_mesh import SceneMesh
 from ast_sim.inference.answer import Answer
 from ast_sim.inference.answering import doubts, in_domain
 from ast_sim.inference.assembly_questions import ask
-from ast_sim.inference.effort import DefaultEffort, Effort, EffortErrors, error_with
+from ast_sim.inference.effort import DefaultEffort, Effort, error_with
 from ast_sim.inference.evaluation import SOLVER_SCENES
 from ast_sim.inference.evaluation.evaluate import evaluate
 from ast_sim.inference.evaluation.evaluated_run import Evaluation
 from ast_sim.inference.predict_arguments import Motions, new_question, scenes_of
 from ast_sim.inference.predicting.question import Question, WantedFrames
-from ast_sim.inference.promises.calibration import Calibration
 from ast_sim.inference.promises.chosen_effort import ErrorLimit, chosen_effort
+from ast_sim.inference.promises.known_answers import known_answers
 from ast_sim.inference.promises.known_weights import KnownWeights, forget_other_weights
 from ast_sim.inference.sweep import Sweep, sweep
 from ast_sim.number_arrays import percent
@@ -66,9 +66,8 @@ class Run:
         self.settings, self.scope = self.folder.settings, self.folder.scope
         self.model = self.folder.load_model()
         _, self.step, answers = self.folder.chosen
-        self.effort = Effort(**answers.get("effort", {"corrections": self.settings.train.corrections}))
-        self.calibration = Calibration.of_run(self.path, answers)
-        self.measured = [EffortErrors.from_json(one) for one in answers.get("valid_by_effort", [])]
+        corrections = self.settings.train.corrections
+        self.effort, self.calibration, self.measured = known_answers(self.path, corrections, answers)
         self.folder.keep_place()
         self.weights = KnownWeights(self.model)
 

@@ -47,7 +47,8 @@ class Reaction:
         linear = linear_elements(scene.elements[soft].astype(np.int64))
         self._laplacian = -igl.cotmatrix(self._rest, linear).tocsr()
         surface = scene.surface()
-        self._surfaces = {int(n): surface[scene.body[surface[:, 0]] == n] for n in np.unique(scene.body)}
+        owner = scene.body[surface[:, 0]]  # a node of no element may be a body without a surface
+        self._surfaces = {int(n): surface[owner == n] for n in np.unique(owner)}
         a, b = surface[:, [0, 1]].T
         self._reach = REACH * float(np.linalg.norm(self._rest[a] - self._rest[b], axis=1).mean())
         self._deforming = np.zeros(scene.num_nodes, bool)

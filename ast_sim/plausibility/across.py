@@ -9,6 +9,7 @@ import numpy as np
 
 from ast_sim.plausibility.axes import Axes, axes, other_order
 from ast_sim.plausibility.findings import Finding
+from ast_sim.plausibility.motion import in_trajectory
 from ast_sim.plausibility.units import Moduli, Stiffness, moduli, other_moduli, other_stress, stiffness
 from ast_sim.scene import Trajectory
 
@@ -17,9 +18,10 @@ _UNITS = 100.0
 
 
 class AcrossSimulations:
-    """Compares the simulations of a dataset."""
+    """Looks at the simulations of a dataset, and compares them; `dynamic`: whether bodies have inertia."""
 
-    def __init__(self) -> None:
+    def __init__(self, dynamic: bool) -> None:
+        self.dynamic = dynamic
         self.names: dict[bytes, str] = {}  # by a digest of the frames
         self.first: tuple[str, float] | None = None  # the name and the size of the first scene
         self.stiffness: list[tuple[str, Stiffness]] = []
@@ -27,7 +29,11 @@ class AcrossSimulations:
         self.axes: list[tuple[str, Axes]] = []
 
     def look(self, name: str, trajectory: Trajectory) -> list[Finding]:
-        """What looks wrong in a simulation beside those before."""
+        """What looks wrong in a simulation, alone and beside the ones before."""
+        return [*in_trajectory(trajectory, self.dynamic), *self.beside(name, trajectory)]
+
+    def beside(self, name: str, trajectory: Trajectory) -> list[Finding]:
+        """What looks wrong in a simulation beside the ones before."""
         stiff = stiffness(trajectory)
         self.stiffness += [] if stiff is None else [(name, stiff)]
         self.moduli.append((name, moduli(trajectory)))

@@ -34,6 +34,7 @@ from ast_sim.runs.model_card import card
 from ast_sim.runs.scope import Scope
 from ast_sim.runs.sealed_line import seal, unseal
 from ast_sim.runs.train_config import RunConfig
+from ast_sim.support.argument_checks import in_short
 from ast_sim.support.disk import replacing
 from ast_sim.support.errors import CheckpointError, ConfigError
 from ast_sim.support.toml_settings import from_values, to_values
@@ -49,6 +50,7 @@ _FACTS, _WEIGHTS, _CARD, _LICENCE, _MANIFEST = (
     "LICENSE",
     "manifest.json",
 )
+_KINDS = {"settings": dict, "scope": dict, "step": int, "answers": dict, "data": str}  # of the facts
 _MEMBERS = (_CARD, _LICENCE, _FACTS, METRICS, _WEIGHTS)
 _TIME = (1980, 1, 1, 0, 0, 0)  # the same run gives the same bytes
 _NO_LICENCE = (
@@ -69,11 +71,13 @@ class RunFile(RunFolder):
     def __init__(self, path: Path) -> None:
         self.path = path
         self._members = _read(path)
-        self.metrics = _KeptMetrics(path, self._members[METRICS].decode())
+        self._facts = _facts_of(path, self._members[_FACTS])
+        self.metrics = _KeptMetrics(path, _text(path, self._members, METRICS))
+        self._licence = _text(path, self._members, _LICENCE)
 
-    @cached_property
-    def _facts(self) -> dict[str, Any]:
-        return json.loads(self._members[_FACTS])
+    @property
+    def licence(self) -> str:
+        return self._licence
 
     @cached_property
     def settings(self) -> RunConfig:
@@ -91,10 +95,6 @@ class RunFile(RunFolder):
     def chosen(self) -> Chosen:
         return Chosen(self.path, self._facts["step"], self._facts["answers"])
 
-    @property
-    def licence(self) -> str | None:
-        return self._members[_LICENCE].decode()
-
     def keep_calibration(self, calibration: Mapping[str, Any]) -> None:
         """Keep it in this object, and so in a file that is written of it; this file stays as it is."""
         self.chosen = self.chosen._replace(answers={**self.chosen.answers, "calibration": dict(calibration)})
@@ -106,7 +106,8 @@ class RunFile(RunFolder):
         try:
             return trained_model(self.settings.model, safetensors.torch.load(self._members[_WEIGHTS]))
         except (SafetensorError, RuntimeError) as error:
-            raise CheckpointError(f"{self.path}: the weights do not fit the settings: {error}") from error
+            why = " ".join(str(error).split())
+            raise CheckpointError(f"{self.path}: the weights do not fit the settings: {why}") from error
 
     def describe(self) -> dict[str, Any]:
         """What `ast-sim info` says of the file."""
@@ -117,7 +118,7 @@ class RunFile(RunFolder):
             **dataclasses.asdict(self.settings),
             "step": self.chosen.step,
             "answers": self.chosen.answers,
-            "licence": (self.licence or "").partition("\n")[0],
+            "licence": self.licence.partition("\n")[0],
         }
 
 
@@ -129,7 +130,11 @@ class _KeptMetrics(Metrics):
         self._lines = text.splitlines()
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
-        return map(unseal, self._lines)
+        for number, line in enumerate(self._lines, 1):
+            try:
+                yield unseal(line)
+            except ValueError as error:
+                raise CheckpointError(f"{self.path}: line {number} of {METRICS} is damaged: {error}") from error
 
 
 def open_run(path: Path) -> RunFolder:
@@ -162,7 +167,7 @@ def write(path: Path, run: RunFolder, model: Simulator, effort: Mapping[str, Any
     }
     weights = {key: tensor.detach().clone().contiguous() for key, tensor in model.state_dict().items()}
     members = {
-        _CARD: card(path.stem, without_path, run.scope, chosen, model.num_parameters).encode(),
+        _CARD: card(path.stem, without_path, run.scope, chosen, model.num_parameters).encode(errors="backslashreplace"),
         _LICENCE: (licence or run.licence or _NO_LICENCE).encode(),
         _FACTS: json.dumps(facts, indent=1, allow_nan=False).encode(),
         METRICS: "".join(map(seal, run.metrics)).encode(),
@@ -181,6 +186,25 @@ def _records(members: dict[str, bytes]) -> dict[str, dict[str, Any]]:
     return {
         name: {"size": len(content), "sha256": hashlib.sha256(content).hexdigest()} for name, content in members.items()
     }
+
+
+def _facts_of(path: Path, content: bytes) -> dict[str, Any]:
+    """The facts of a run, each of its kind."""
+    try:
+        facts = json.loads(content)
+        wrong = [key for key, kind in _KINDS.items() if not isinstance(facts[key], kind)]
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise CheckpointError(f"{path}: {_FACTS} is damaged: {type(error).__name__}: {error}") from error
+    if wrong:
+        raise CheckpointError(f"{path}: {_FACTS} is damaged: {wrong[0]} is {in_short(facts[wrong[0]])}")
+    return facts
+
+
+def _text(path: Path, members: Mapping[str, bytes], name: str) -> str:
+    try:
+        return members[name].decode()
+    except UnicodeDecodeError as error:
+        raise CheckpointError(f"{path}: {name} is damaged: it is no text") from error
 
 
 def _read(path: Path) -> dict[str, bytes]:

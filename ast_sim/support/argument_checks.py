@@ -17,9 +17,18 @@ def file_name(value: Any, name: str) -> Path:
     Raises:
         ConfigError: it is neither a text nor a path, or it is empty; the text names the argument `name`.
     """
-    if not isinstance(value, str | os.PathLike) or not os.fspath(value) or "\0" in str(value):
+    if not is_file_name(value):
         raise ConfigError(f"{name} is {in_short(value)}; it must be the name of a file or a folder")
     return at_home(Path(value))
+
+
+def is_file_name(value: Any) -> bool:
+    """Whether the value is a text or a path that can name a file."""
+    try:
+        text = os.fspath(value)
+        return isinstance(text, str) and "\0" not in text and os.fsencode(text) != b""
+    except (TypeError, UnicodeEncodeError):  # no path; or half of a pair of UTF-16, which no name has
+        return False
 
 
 def at_home(path: Path) -> Path:

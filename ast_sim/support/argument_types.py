@@ -4,15 +4,27 @@ from __future__ import annotations
 
 import argparse
 import pkgutil
-from collections.abc import Callable, Iterable, Mapping
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
-from ast_sim.support.argument_checks import at_home
+from ast_sim.support.argument_checks import at_home, is_file_name
 from ast_sim.support.errors import ConfigError, printable
 
 Key = TypeVar("Key")
 Value = TypeVar("Value")
+
+
+class _Once(argparse.Action):
+    """An option that takes one value. A second one is an error; argparse would take it in place of the first."""
+
+    def __call__(self, parser: argparse.ArgumentParser, namespace: Any, values: Any, option: str | None = None) -> None:
+        before = vars(namespace).setdefault("_given", set())
+        if option is not None and self.dest in before:
+            parser.error(f"{option} is given twice: leave one out")
+        before.add(self.dest)
+        setattr(namespace, self.dest, values)
 
 
 class Parser(argparse.ArgumentParser):
@@ -21,20 +33,28 @@ class Parser(argparse.ArgumentParser):
 
     more: Callable[[], list[str]] = list
 
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self.register("action", None, _Once)
+        self.register("action", "store", _Once)
+
+    def read(self, words: Sequence[str], into: argparse.Namespace) -> None:
+        """Read the arguments. A value -- is refused first: argparse would leave an option without its value."""
+        for word in words:
+            if word.startswith("--") and word.endswith("=--"):
+                self.error(f"{word}: -- is no value")
+        self.parse_args(words, into)
+
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"{self.prog}: {printable(message)} (see {self.prog} --help)\n")
 
+    def _print_message(self, message: str, file: Any = None) -> None:
+        """Of argparse, which keeps quiet where a help cannot be written."""
+        if message:
+            (file or sys.stderr).write(message)
+
     def format_help(self) -> str:
         return super().format_help() + "".join(f"{line}\n" for line in self.more())
-
-
-class Once(argparse.Action):
-    """An option that takes one value and may be taken for one that may be repeated: a second value is an error."""
-
-    def __call__(self, parser: argparse.ArgumentParser, namespace: Any, values: Any, option: str | None = None) -> None:
-        if getattr(namespace, self.dest) is not None:
-            parser.error(f"{option} is given twice: leave one out")
-        setattr(namespace, self.dest, values)
 
 
 def add_each(to: Any, options: Mapping[str, str], **shared: Any) -> None:
@@ -55,7 +75,7 @@ def add_overwrite(to: Parser) -> None:
 
 def path(text: str) -> Path:
     """The name of a file or a folder; ~ is the home folder, also in --out=~/x, where a shell leaves it."""
-    if not text or "\0" in text:
+    if not is_file_name(text):
         raise argparse.ArgumentTypeError(f"{text!r} is no name of a file or a folder")
     return at_home(Path(text))
 

@@ -7,18 +7,19 @@ from collections.abc import Mapping
 from html import escape
 from typing import Any
 
+from ast_sim.support.errors import printable
+
 
 def one_line(kind: str, facts: Mapping[str, Any]) -> str:
     """Such as "Scene(bodies: 2, nodes: 351)"."""
-    return f"{kind}({', '.join(f'{key}: {value}' for key, value in facts.items())})"
+    return f"{kind}({', '.join(f'{key}: {printable(str(value))}' for key, value in facts.items())})"
 
 
 def html_table(title: str, facts: Mapping[str, Any], picture: str = "") -> str:
     """A table of facts in HTML, and a picture (HTML) beside it; titles and facts are texts, not HTML."""
-    rows = "".join(
-        f'<tr><th style="text-align:left">{escape(key)}</th><td style="text-align:left">{escape(str(value))}</td></tr>'
-        for key, value in facts.items()
-    )
+    left = 'style="text-align:left"'
+    shown = {escape(key): escape(printable(str(value))) for key, value in facts.items()}
+    rows = "".join(f"<tr><th {left}>{key}</th><td {left}>{value}</td></tr>" for key, value in shown.items())
     table = f"<table><caption><b>{escape(title)}</b></caption><tbody>{rows}</tbody></table>"
     if not picture:
         return table

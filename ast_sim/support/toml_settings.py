@@ -134,9 +134,9 @@ def assigned(obj: Any, assignments: Iterable[str]) -> dict[str, Any]:
 
 
 def leaves(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """(dotted key, value) of every value of a TOML table that is no table."""
+    """(dotted key, value) of every value of a TOML table that is no table, or an empty one."""
     for key, value in table.items():
-        if isinstance(value, Mapping):
+        if isinstance(value, Mapping) and value:
             yield from leaves(value, f"{prefix}{key}.")
         else:
             yield prefix + key, value
@@ -155,6 +155,8 @@ def change(obj: T, values: Mapping[str, Any]) -> T:
 def _with(cls: type[T], given: Any, values: Mapping[str, Any]) -> T:
     """Settings of a class with values by dotted key, the others from `given`; `_leaves` says what that is."""
     kinds = {key: kind for key, _, kind in _leaves(cls, given)}
+    groups = {key.rpartition(".")[0] for key in kinds}
+    values = {key: value for key, value in values.items() if key not in groups or value}  # a group may say nothing
     for key in values:
         if key not in kinds:
             raise _unknown(kinds, key, _facts(cls, given))

@@ -23,8 +23,8 @@ STEEL, SOFT = (2.1e11, 0.3), (2.1e5, 0.3)
 
 def told(simulations):
     """(number of the simulation, what looks wrong)."""
-    across = AcrossSimulations()
-    alone = [(str(number), one) for number, t in enumerate(simulations) for one in across.look(str(number), t)]
+    across = AcrossSimulations(dynamic=False)
+    alone = [(str(number), one) for number, t in enumerate(simulations) for one in across.beside(str(number), t)]
     return [(int(name), one.what) for name, one in (*alone, *across.all_together())]
 
 

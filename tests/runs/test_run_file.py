@@ -1,5 +1,9 @@
 """A run as one file: the same answers from another place, nothing of this machine in it, no damage in silence."""
 
+import functools
+import json
+import operator
+import os
 import re
 import shutil
 import zipfile
@@ -180,3 +184,74 @@ def test_a_licence_is_a_text(saved, tmp_path):
 def test_the_name_ends_in_ast(saved, tmp_path):
     with pytest.raises(CheckpointError, match=r"run.zip: the name of a run file must end in .ast"):
         saved[1].save(tmp_path / "run.zip")
+
+
+def edited(saved, path: Path, name: str, content: bytes) -> Path:
+    """A copy of the file with another member, and a manifest that fits."""
+    changed = {**members(saved[0]), name: content}
+    manifest = json.loads(changed.pop("manifest.json"))
+    manifest["files"] = run_file._records(changed)
+    with zipfile.ZipFile(path, "w") as archive:
+        for key, value in {**changed, "manifest.json": json.dumps(manifest).encode()}.items():
+            archive.writestr(key, value)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "text"),
+    [
+        ("run.json", b"", "run.json is damaged: JSONDecodeError"),
+        ("run.json", b"\xff\xfe", "run.json is damaged: "),
+        ("run.json", b"[" * 100_000, "run.json is damaged: RecursionError"),
+        ("run.json", b"null", "run.json is damaged: TypeError"),
+        ("run.json", b"[]", "run.json is damaged: TypeError"),
+        ("run.json", b"{}", "run.json is damaged: KeyError: 'settings'"),
+        ("LICENSE", b"\xff\xfe", "LICENSE is damaged: it is no text"),
+        ("metrics.jsonl", b"\xff\xfe", "metrics.jsonl is damaged: it is no text"),
+        ("model.safetensors", b"{}", "the weights do not fit the settings: "),
+    ],
+)
+def test_an_edited_file_whose_manifest_fits_is_one_line(saved, tmp_path, name, content, text):
+    path = edited(saved, tmp_path / "edited.ast", name, content)
+    with pytest.raises(CheckpointError, match=re.escape(f"{path}: {text}")) as error:
+        Run(path)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "text"),
+    [
+        (("settings",), [], "run.json is damaged: settings is of the type list"),
+        (("step",), "2", "run.json is damaged: step is '2'"),
+        (("data",), None, "run.json is damaged: data is None"),
+        (("settings", "model", "hidden"), {}, "model.hidden is {}; must be an integer"),
+        (("settings", "model", "hidden"), 7, "the weights do not fit the settings: Error(s) in loading"),
+        (("answers", "effort"), [1], "what it keeps of its answers cannot be read: "),
+        (("answers", "effort"), {"corrections": -1}, "what it keeps of its answers cannot be read: corrections is -1"),
+        (("answers", "effort"), {"calls": 1}, "what it keeps of its answers cannot be read: "),
+        (("answers", "valid_by_effort"), [{"error": 0.1}], "what it keeps of its answers cannot be read: 'effort'"),
+        (("answers", "valid_by_effort", 0, "error"), "<b>", "answers cannot be read: '<b>' is no number"),
+    ],
+)
+def test_an_edited_fact_of_another_kind_is_one_line(saved, tmp_path, place, value, text):
+    facts = json.loads(members(saved[0])["run.json"])
+    *parents, last = place
+    functools.reduce(operator.getitem, parents, facts)[last] = value
+    path = edited(saved, tmp_path / "edited.ast", "run.json", json.dumps(facts).encode())
+    with pytest.raises((CheckpointError, ConfigError), match=re.escape(text)) as error:
+        Run(path)
+    assert "\n" not in str(error.value)
+
+
+def test_a_damaged_curve_is_told_where_it_is_read(saved, tmp_path):
+    run = Run(edited(saved, tmp_path / "edited.ast", "metrics.jsonl", b'{"step": 1}\n'))
+    with pytest.raises(CheckpointError, match=r"edited.ast: line 1 of metrics.jsonl is damaged: it is no sealed line"):
+        run.save(tmp_path / "again.ast")
+    assert not (tmp_path / "again.ast").exists()
+
+
+def test_a_name_of_bytes_that_are_no_text(saved, tmp_path):
+    """A name that a shell can type; the model card shows it with an escape."""
+    path = Path(os.fsdecode(bytes(tmp_path) + b"/b\xff.ast"))
+    saved[1].save(path)
+    assert Run(path).step == saved[1].step and b"# b\\udcff\n" in members(path)["README.md"]

@@ -261,3 +261,15 @@ def test_whole_numbers_are_of_any_integer_type():
             whole(frames=value)
     with pytest.raises(ConfigError, match="frames is 1; it must be at least 2"):
         whole(2, frames=1)
+
+
+def test_an_empty_table_is_no_value():
+    """It was passed over, and the default taken; a group may be empty."""
+    assert from_toml(Run, 'data = "d.h5"\n[model]\n') == Run(Model(), "d.h5")
+    for text, told in (
+        ('data = "d.h5"\nmodel = { hidden = {} }', r"model.hidden is \{\}; must be an integer"),
+        ("data = {}", r"data is \{\}; must be a text"),
+        ('data = "d.h5"\n[other]\n', "there is no setting other"),
+    ):
+        with pytest.raises(ConfigError, match=told):
+            from_toml(Run, text)

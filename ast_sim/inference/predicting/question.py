@@ -16,6 +16,7 @@ from ast_sim.models.data_facts import DataFacts
 from ast_sim.models.model_config import ModelConfig
 from ast_sim.named_field import STRESS, NamedField
 from ast_sim.scene import Scene, Trajectory
+from ast_sim.support.argument_checks import in_short
 from ast_sim.support.errors import ConfigError, RolloutError
 from ast_sim.support.toml_settings import NOTHING
 
@@ -150,13 +151,13 @@ def fields_of(trajectory: Trajectory) -> dict[str, np.ndarray]:
 
 def _whole_numbers(frames: WantedFrames, count: int) -> list[int]:
     """The frames, of `count`, as a list; one number is a frame, too."""
-    wrong = f"frames must be whole numbers, one such number, or a slice, not {frames!r}"
+    wrong = f"frames must be whole numbers, one such number, or a slice, not {in_short(frames)}"
     if isinstance(frames, slice):
         try:
             return list(range(count)[frames])
         except (TypeError, ValueError) as error:  # bounds that are no whole numbers, or a step of 0
             raise ConfigError(wrong) from error
-    if isinstance(frames, Mapping):
+    if isinstance(frames, Mapping) or np.ma.is_masked(frames):
         raise ConfigError(wrong)
     try:
         listed = np.asarray(list(frames) if isinstance(frames, Iterable) else [frames])

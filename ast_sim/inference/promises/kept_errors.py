@@ -72,6 +72,7 @@ class KeptErrors:
             raise ConfigError("no error is asked for: give one, such as 0.02 or {'reaction': 0.05}")
         for quantity, error in wanted.items():
             self._require(quantity, error)
+        wanted = {quantity: float(error) for quantity, error in wanted.items()}
         limits = np.array(list(wanted.values()))[:, None, None]
         errors = np.array([self.errors[quantity] for quantity in wanted])
         above: np.ndarray = np.any(errors > limits, axis=0)

@@ -45,7 +45,10 @@ def effort_within(run: Run, question: Question, ms: float) -> tuple[Effort, str]
     """
     if not isinstance(ms, Real) or isinstance(ms, bool) or not ms > 0:
         raise ConfigError(f"ms is {in_short(ms)}; it must be a number above 0")
-    ms = float(min(ms, LARGEST))
+    try:
+        ms = min(float(ms), LARGEST)
+    except OverflowError:  # a whole number of more than 308 digits
+        ms = LARGEST
     efforts = choices(run.settings.model, run.settings.train.corrections)
     errors = {effort: run.expected_error(effort) for effort in efforts}
     known = {effort: error for effort, error in errors.items() if error is not None}
