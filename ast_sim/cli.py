@@ -178,7 +178,8 @@ def _add_convert(convert: Parser) -> None:
     fields = convert.add_argument_group("names of the fields in the files")
     names = {
         "--displacement NAME": "point field, displacement from rest; if there is none, the points themselves move",
-        "--stress NAME": "point or cell field with the von Mises stress, or with the components of a stress tensor",
+        "--stress NAME": "point or cell field with the von Mises stress, or with the components of a stress tensor; or"
+        " what fields of one component each have in common, such as S of S11, S22, ...",
         "--node-type NAME": "point field: 0 normal, 1 obstacle, 3 handle",
         "--obstacle NAME": "point field that is not zero at the nodes of obstacles; or a group of nodes, or BODY:all",
         "--handle NAME": "the same for prescribed nodes of deforming bodies; a place is written BODY:PLACE, as 0:zmin",

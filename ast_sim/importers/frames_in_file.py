@@ -20,7 +20,7 @@ from ast_sim.importers.formats.gmsh_files import gmsh_frames
 from ast_sim.importers.formats.source_mesh import CellBlock, SourceMesh, from_meshio
 from ast_sim.importers.formats.stl_file import BadSurface, read_stl
 from ast_sim.importers.formats.vtk_files import BLOCKS, ENDINGS, is_dyna, vtk_frames
-from ast_sim.importers.meshio_files import by_meshio, what_meshio_says
+from ast_sim.importers.meshio_files import BY_MESHIO, by_meshio, what_meshio_says
 from ast_sim.support.errors import DatasetError
 
 # Formats whose files hold all frames of a simulation.
@@ -29,6 +29,11 @@ WITH_FRAMES = (".vtkhdf", ".frd", ".e", ".ex2", ".exo", ".exoii", ".exii")
 # Formats in which each frame is a file of its own; files of the last ones may hold all frames.
 XDMF = (".xdmf", ".xmf")
 ONE_FRAME = (".vtu", ".pvtu", ".vtk", ".vtp", ".pvtp", ".vts", ".pvts", *BLOCKS, *XDMF, ".msh")
+
+
+def is_of_known_kind(path: Path) -> bool:
+    """Whether the kind of a file, by its name, is one that `frames_in` reads."""
+    return path.suffix.lower() in (*ENDINGS, ".inp", ".stl", *BY_MESHIO) or is_dyna(path)
 
 
 def holds_frames(path: Path) -> bool:

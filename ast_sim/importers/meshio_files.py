@@ -21,6 +21,7 @@ _INSTEAD = "write it as .vtu, .vtk, .msh or .inp"
 _KINDS = (".xdmf", ".xmf", ".mesh", ".meshb", ".med", ".vol", ".node", ".ele", ".ply", ".off", ".obj", ".avs")
 _NASTRAN = (".bdf", ".fem", ".nas")
 _OTHER_KINDS = (".f3grid", ".ugrid", ".xml", ".msh")  # the last as meshio writes it itself, if nobody names a format
+BY_MESHIO = (*_KINDS, *_NASTRAN, *_OTHER_KINDS)
 
 # Cards of Nastran: elements that meshio reads, and cards with the same first letter that are no elements of a volume or
 # a surface.
@@ -41,7 +42,7 @@ def by_meshio(path: Path, copy: Path | None = None) -> SourceMesh:
         DatasetError: it is of a kind that is not read, is damaged, or holds what meshio reads over.
     """
     ending = path.suffix.lower()
-    if ending not in (*_KINDS, *_NASTRAN, *_OTHER_KINDS):
+    if ending not in BY_MESHIO:
         raise DatasetError(
             f"{path}: cannot be read as a mesh: files of the kind {path.suffix} are not read; {_INSTEAD}"
         )

@@ -28,7 +28,7 @@ from ast_sim.importers.solids.positions import far_origin, rest_and_position, wa
 from ast_sim.importers.solids.stitching import Stitching
 from ast_sim.importers.solved_jobs.job import Job, read_job
 from ast_sim.importers.solved_jobs.job_results import job_frames
-from ast_sim.importers.stress import STRESS_UNITS, are_components, order_of, von_mises
+from ast_sim.importers.stress import STRESS_UNITS, of_components, order_of, stem_of, stems_of, von_mises
 from ast_sim.plausibility.axes import MIRRORED
 from ast_sim.scene import NodeType, Scene, Trajectory
 from ast_sim.support.argument_checks import several
@@ -43,8 +43,8 @@ class FieldNames:
     Attributes:
         displacement: point field, the displacement from rest. None: "displacement" if it is present; else the points
             themselves move, and the first frame is at rest.
-        stress: point or cell field: the von Mises stress, or the components of a stress tensor. None: "von_mises" if
-            it is present.
+        stress: point or cell field: the von Mises stress, or the components of a stress tensor; or what the names of
+            fields of one component each have in common, "S" of S11, S22, .... None: "von_mises" if it is present.
         node_type: point field with the numbers of `NodeType`. None: "node_type" if it is present; else all nodes are
             NORMAL.
         obstacle, handle: what the nodes of obstacles and the handles are: a point field that is not zero there, a group
@@ -180,6 +180,7 @@ def _read_frames(
     given = frames(source) if job is None else job_frames(job, source, _pascals(names), tuple(further.wanted.values()))
     for frame in given:
         frame.require_consistent()
+        frame = frame if names.stress is None else of_components(frame, names.stress, names.stress_order)
         if first is None or stitching is None:
             first = frame
             stitching = Stitching(frame)
@@ -267,11 +268,15 @@ def _stress_place(frame: SourceMesh, names: FieldNames) -> tuple[str, tuple[str,
     if place == "none":
         if names.stress is not None:
             known = sorted({*frame.point_fields, *frame.cell_fields})
-            parts = "; components that are fields of their own cannot be taken: write them as one field, or the von"
-            parts = f"{parts} Mises stress" if are_components(known) else ""
+            stems = " or ".join(map(repr, stems_of(known)))
+            parts = f"; a stress whose components are fields is named by what these have in common: {stems}"
             listed = ", ".join(known) or "none"
-            raise DatasetError(f"{frame.path}: there is no field {names.stress!r}; there are: {listed}{parts}")
+            told = f"there is no field {names.stress!r}; there are: {listed}{parts if stems else ''}"
+            raise DatasetError(f"{frame.path}: {told}")
         return place, (), []
+    whole = stem_of(name, [*frame.point_fields, *frame.cell_fields])
+    if whole:
+        raise DatasetError(f"{frame.path}: {name!r} is one component of a stress: name what all have, {whole!r}")
     values = raw_field(frame, "point" if place == "node" else "cell", name)
     order = order_of(frame.path, name, values, frame.columns.get(name, ()), names.stress_order)
     both = name in frame.point_fields and name in frame.cell_fields

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import re
+from collections import defaultdict
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from ast_sim.importers.formats.source_mesh import SourceMesh
 from ast_sim.importers.frames_in_file import XDMF
 from ast_sim.support.errors import ConfigError, DatasetError
 
@@ -27,6 +30,12 @@ _IN_THE_PLANE = ("xx", "xy", "yx", "yy")
 STRESS_UNITS = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "GPa": 1e9, "psi": 6894.757293168}
 
 _AXES = {"1": "x", "2": "y", "3": "z", **{axis: axis for axis in "xyz"}}
+
+# What a name ends with that is a component: stress_xy, S11, sigma-xz, Stress(y,y), and, for a normal stress, SX.
+_BETWEEN = r"(.*?)[ _.:(\[-]*"
+_TWO_AXES = re.compile(_BETWEEN + r"([xyz123])[ ,_-]?([xyz123])[)\]]?", re.IGNORECASE)
+_BARE = re.compile(r"[ _.:(\[-]+$")
+_ONE_AXIS = re.compile(_BETWEEN + r"([xyz])[)\]]?", re.IGNORECASE)
 
 
 def parse_order(text: str) -> tuple[str, ...]:
@@ -73,9 +82,14 @@ def order_of(
         if not _is_order(given):
             raise DatasetError(f"{path}: {', '.join(given)} is no order of the components of {name!r}")
         return given
-    read = tuple(_component(text) for text in names)
+    read = tuple(component for _, component in map(_split, names))
     if len(read) == columns and _is_order(read):
         return read
+    if any(read):
+        raise DatasetError(
+            f"{path}: the columns of {name!r} are called {', '.join(names)}, which is no order of the components of a"
+            " stress: say it, stress_order=('xx', ...) (--stress-order xx,...)"
+        )
     doubt = _doubt_of_order(path, values)
     if doubt:
         raise DatasetError(f"{path}: the order of the {columns} components of {name!r} is not certain: {doubt}")
@@ -97,9 +111,78 @@ def _doubt_of_order(path: Path, values: np.ndarray) -> str:
     return ""
 
 
-def are_components(names: Iterable[str]) -> bool:
-    """Whether fields of these names seem to be the components of a stress."""
-    return len({_sorted(_component(name)) for name in names} & set(_NORMAL_FIRST)) >= len(_ORDERS[4])
+def stems_of(names: Iterable[str]) -> list[str]:
+    """What the names of fields have in common that seem to be the components of one stress: "S" of S11, S22, ..."""
+    components = defaultdict(set)
+    written: dict[str, str] = {}
+    for name in names:
+        stem, component = _split(name)
+        components[stem.casefold()].add(_sorted(component))
+        written.setdefault(stem.casefold(), stem)
+    least = len(_ORDERS[4])
+    return [written[stem] for stem, held in components.items() if len(held & {*_NORMAL_FIRST}) >= least]
+
+
+def stem_of(name: str, names: Iterable[str]) -> str:
+    """The one of `stems_of` fields of which the field `name` is a component; "" if none."""
+    stem, component = _split(name)
+    return next((one for one in stems_of(names) if component and one.casefold() == stem.casefold()), "")
+
+
+def of_components(frame: SourceMesh, name: str, given: tuple[str, ...]) -> SourceMesh:
+    """A frame with the stress `name` as one field, if the file has a field for each component, such as S11 or
+    stress_xy. Its columns stand in the `given` order, else as usual.
+
+    Raises:
+        DatasetError: a component is missing, stands twice, or has several columns; the text names it.
+    """
+    if name in frame.point_fields or name in frame.cell_fields:
+        return frame
+    at_points = {field: np.asarray(values) for field, values in frame.point_fields.items()}
+    of_cells = {field: np.concatenate(parts) for field, parts in frame.cell_fields.items() if parts}
+    both = [_held(frame.path, name, fields) for fields in (at_points, of_cells)]
+    if not any(both):
+        return frame
+    solid = any(block.dimension == 3 for block in frame.blocks)
+    orders = [given] if given else [_NORMAL_FIRST, *([] if solid else [_ORDERS[4]])]
+    whole = [(held, order) for held in both for order in orders if {*order} <= held.keys()]
+    if not whole:
+        there = max(both, key=len)
+        lacking = ", ".join(component for component in orders[-1] if component not in there)
+        listed = ", ".join(dict.fromkeys(field for field, _ in there.values()))
+        raise DatasetError(
+            f"{frame.path}: of the components of {name!r}, {lacking} are missing; there are {listed}: write all of them"
+            " (0 where there is no stress), or the von Mises stress"
+        )
+    held, order = whole[0]
+    values = np.stack([held[component][1] for component in order], axis=1)
+    frame = replace(frame, columns={**frame.columns, name: order})
+    if held is both[0]:
+        return replace(frame, point_fields={**frame.point_fields, name: values})
+    parts = np.split(values, np.cumsum([len(block.nodes) for block in frame.blocks])[:-1])
+    return replace(frame, cell_fields={**frame.cell_fields, name: parts})
+
+
+def _held(path: Path, name: str, fields: dict[str, np.ndarray]) -> dict[str, tuple[str, np.ndarray]]:
+    """The field and the values of each component of a stress; xy also stands for yx. Two or three columns are a row
+    of the tensor: VTK makes `stress_x` of the fields stress_xx, stress_xy and stress_xz of Exodus."""
+    held: dict[str, tuple[str, np.ndarray]] = {}
+    for field, values in fields.items():
+        stem, component = _split(field)
+        if not component or stem.casefold() != _BARE.sub("", name).casefold() or values.dtype.kind not in "iufb":
+            continue
+        columns = values.reshape(len(values), -1)
+        count = columns.shape[1]
+        if count > 1 and (count > 3 or _TWO_AXES.fullmatch(field.strip())):
+            raise DatasetError(f"{path}: the field {field!r} must have one number in each row, as a part of a stress")
+        parts = [component[0] + axis for axis in "xyz"[:count]] if count > 1 else [component]
+        for part, column in zip(parts, columns.T, strict=True):
+            if part in held:
+                raise DatasetError(f"{path}: the component {part} of {name!r} is {held[part][0]!r} and {field!r}")
+            held[part] = field, column
+    for part in [*held]:
+        held.setdefault(part[::-1], held[part])
+    return held
 
 
 def von_mises(values: np.ndarray, order: tuple[str, ...]) -> np.ndarray:
@@ -115,10 +198,13 @@ def von_mises(values: np.ndarray, order: tuple[str, ...]) -> np.ndarray:
     return np.sqrt(normal / 2 + 3 * (xy**2 + yz**2 + xz**2))
 
 
-def _component(text: str) -> str:
-    """The component that the name of a column ends with: "xy" of SXY, S12, stress_XY; "" if none."""
-    axes = re.search(r"([xyz123])[ ,_-]?([xyz123])$", text.strip().lower())
-    return _AXES[axes[1]] + _AXES[axes[2]] if axes else ""
+def _split(text: str) -> tuple[str, str]:
+    """The name of a field or column without the component at its end, and the component; "" if none."""
+    two = _TWO_AXES.fullmatch(text.strip())
+    if two:
+        return two[1], _AXES[two[2].lower()] + _AXES[two[3].lower()]
+    one = _ONE_AXIS.fullmatch(text.strip())
+    return (one[1], 2 * one[2].lower()) if one else (text, "")
 
 
 def _sorted(component: str) -> str:

@@ -25,14 +25,22 @@ def pressed(frame):
     return PAD.rest_position * np.array((0, 0, -0.05 * frame))
 
 
-def write_exodus(path, numbers):
-    """Three frames of the pad, whose nodes have these numbers, with the sets of nodes LOW and TOP."""
+def write_exodus(path, numbers, further=None):
+    """Three frames of the pad, whose nodes have these numbers, with the sets of nodes LOW and TOP; `further` fields
+    have one number in each frame."""
+    fields = {f"displ{axis}": [pressed(frame)[:, index] for frame in range(3)] for index, axis in enumerate("xyz")}
+    fields |= {name: [np.full(N, frame * value) for frame in range(3)] for name, value in (further or {}).items()}
     with netcdf_file(path, "w", version=2) as file:
         file.version = file.api_version = np.float32(5.1)
         file.floating_point_word_size = np.int32(8)
         file.file_size = np.int32(1)
         sizes = {"time_step": None, "len_string": 33, "num_dim": 3, "num_nodes": N, "num_elem": len(PAD.elements)}
-        sizes |= {"num_el_blk": 1, "num_el_in_blk1": len(PAD.elements), "num_nod_per_el1": 4, "num_nod_var": 3}
+        sizes |= {
+            "num_el_blk": 1,
+            "num_el_in_blk1": len(PAD.elements),
+            "num_nod_per_el1": 4,
+            "num_nod_var": len(fields),
+        }
         sizes |= {"num_node_sets": 2, "num_nod_ns1": len(LOW), "num_nod_ns2": len(TOP)}
         for name, size in sizes.items():
             file.createDimension(name, size)
@@ -53,10 +61,9 @@ def write_exodus(path, numbers):
         for number, nodes in enumerate((LOW, TOP), 1):
             put(f"node_ns{number}", f"num_nod_ns{number}", values=nodes + 1)
         put("time_whole", "time_step", values=[0.0, 0.5, 1.0], kind="d")
-        put("name_nod_var", "num_nod_var", "len_string", values=characters("displx", "disply", "displz"), kind="c")
-        for axis in range(3):
-            values = np.stack([pressed(frame)[:, axis] for frame in range(3)])
-            put(f"vals_nod_var{axis + 1}", "time_step", "num_nodes", values=values, kind="d")
+        put("name_nod_var", "num_nod_var", "len_string", values=characters(*fields), kind="c")
+        for number, values in enumerate(fields.values(), 1):
+            put(f"vals_nod_var{number}", "time_step", "num_nodes", values=np.stack(values), kind="d")
 
 
 def characters(*texts):
@@ -73,6 +80,19 @@ def test_sets_of_nodes_of_exodus_are_groups(tmp_path):
         assert (read.scene.rest_position[read.scene.node_type == NodeType.OBSTACLE][:, 2] == 2).all()
         assert (read.scene.node_type == NodeType.OBSTACLE).sum() == len(TOP)
         np.testing.assert_allclose(read.position[2, :, 2], 0.9 * read.scene.rest_position[:, 2], rtol=1e-6)
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2, 3, 4, 5), (0, 3, 4, 1, 5, 2), (5, 4, 3, 2, 1, 0), (3, 0, 5, 2, 4, 1)])
+@pytest.mark.parametrize("names", ["stress_{}", "S{}"])
+def test_the_stress_of_exodus_is_put_together(tmp_path, order, names):
+    """VTK joins fields whose names end in x, y and z to vectors, and six to a tensor: in MOOSE's order (xx, xy, xz, yy,
+    yz, zz) the first three alone."""
+    parts = dict(zip(("xx", "yy", "zz", "xy", "yz", "xz"), (1.0, 2.0, 4.0, 8.0, 16.0, 32.0), strict=True))
+    named = {names.format(list(parts)[index]): list(parts.values())[index] for index in order}
+    write_exodus(tmp_path / "job.exo", 1 + np.arange(N), named)
+    read = read_series(tmp_path / "job.exo", FieldNames("displ", stress=names.format(""), handle="low"))
+    right = np.sqrt(7 + 3 * (8**2 + 16**2 + 32**2))
+    np.testing.assert_allclose(read.stress[:, :, 0], np.full((3, N), right) * [[0], [1], [2]], rtol=1e-6)
 
 
 @pytest.mark.parametrize("lost", [8, 200, 656, 2000])

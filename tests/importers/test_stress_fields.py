@@ -8,7 +8,7 @@ from blocks import block
 
 from ast_sim.importers.mesh_file import read_mesh
 from ast_sim.importers.series import FieldNames, read_series
-from ast_sim.importers.stress import are_components, parse_order
+from ast_sim.importers.stress import parse_order, stems_of
 from ast_sim.plausibility.motion import in_trajectory
 from ast_sim.simulate.shapes.mesh import second_order
 from ast_sim.support.errors import ConfigError, DatasetError
@@ -40,6 +40,7 @@ def as_xdmf(folder, order):
 
 
 def as_vtu(folder, fields, of_cells=None, names="f_{}.vtu"):
+    folder.mkdir(exist_ok=True)
     for frame in range(3):
         points = {"displacement": pressed(frame), **{name: make(frame) for name, make in fields.items()}}
         cells = {name: [make(frame)] for name, make in (of_cells or {}).items()}
@@ -85,6 +86,22 @@ def test_no_stress_across_the_plane_is_no_doubt(tmp_path):
     assert read(source, stress="s").stress[2].max() == pytest.approx(2 * np.sqrt(1 + 3 * 8**2))
 
 
+@pytest.mark.parametrize(("names", "right"), [("SX SXY SXZ SY SYZ SZ", True), ("XX XY XZ YY YZ Z1", False)])
+def test_the_names_of_columns_are_their_order_or_refused(tmp_path, names, right):
+    for frame in range(3):
+        grid = pyvista.from_meshio(meshio.Mesh(POINTS, [("tetra", CUBE.elements)]))
+        grid.point_data["displacement"], grid.point_data["s"] = pressed(frame), columns(OF_XDMF, frame)
+        for column, name in enumerate(names.split()):
+            grid.point_data.GetArray("s").SetComponentName(column, name)
+        grid.save(tmp_path / f"f_{frame}.vtu")
+    if right:
+        assert read(tmp_path, stress="s").stress[2].max() == pytest.approx(2 * IN_SPACE)
+        return
+    with pytest.raises(DatasetError, match="the columns of 's' are called XX, XY, XZ, YY, YZ, Z1, which is no order"):
+        read(tmp_path, stress="s")
+    assert read(tmp_path, stress="s", stress_order=OF_XDMF).stress[2].max() == pytest.approx(2 * IN_SPACE)
+
+
 @pytest.mark.parametrize("text", ["xx,yy,zz,xy", "xx,xy,yx,yy", "xx,xy,xz,yy,yz,zz", ",".join(FULL)])
 def test_an_order_has_each_component_once(text):
     order = parse_order(text)
@@ -99,11 +116,71 @@ def test_an_order_in_python_has_components_only(tmp_path):
         read(source, stress="s", stress_order=tuple("abcdef"))
 
 
-def test_a_stress_in_fields_of_its_components_is_refused_with_what_to_write(tmp_path):
-    source = as_vtu(tmp_path, {f"stress_{one}": (lambda frame: np.ones(NODES)) for one in OF_XDMF})
-    with pytest.raises(DatasetError, match="no field 'stress_'; .*write them as one field, or the von Mises stress"):
-        read(source, stress="stress_")
-    assert not are_components(["displacement", "S_Mises", "max", "fix"])
+def of_components(pattern, order=OF_XDMF, axes="xyz"):
+    """Fields whose names end with their component, in alphabetical order of neither the names nor the components."""
+    place = str.maketrans("xyz", axes)
+    return {pattern.format(one.translate(place)): (lambda frame, one=one: columns([one], frame)) for one in order}
+
+
+@pytest.mark.parametrize(
+    ("stress", "pattern", "axes"),
+    [
+        ("S", "S{}", "123"),
+        ("stress", "stress_{}", "xyz"),
+        ("stress_", "Stress_{}", "XYZ"),
+        ("sigma", "sigma-{}", "xyz"),
+    ],
+)
+@pytest.mark.parametrize("order", [OF_XDMF, OF_XDMF[::-1], FULL])
+@pytest.mark.parametrize("at", ["node", "element"])
+def test_a_stress_in_fields_of_its_components_is_put_together(tmp_path, stress, pattern, axes, order, at):
+    fields = of_components(pattern, order, axes)
+    if at == "element":
+        fields = {name: (lambda frame, make=make: make(frame)[:ELEMENTS]) for name, make in fields.items()}
+    result = read(as_vtu(tmp_path, *((fields,) if at == "node" else ({}, fields))), stress=stress)
+    assert result.stress_at == at
+    np.testing.assert_allclose(result.stress[:, 0, 0], [0, IN_SPACE, 2 * IN_SPACE], rtol=1e-6)
+    assert f"is computed from the components xx, yy, zz, xy, yz, xz of '{stress}'" in notes(result)
+
+
+def test_normal_stresses_of_one_letter_are_components(tmp_path):
+    fields = {
+        name: (lambda frame, one=one: columns([one], frame))
+        for name, one in {"SX": "xx", "SY": "yy", "SZ": "zz", "SXY": "xy", "SYZ": "yz", "SXZ": "xz"}.items()
+    }
+    assert read(as_vtu(tmp_path, fields), stress="S").stress[2].max() == pytest.approx(2 * IN_SPACE)
+
+
+def test_an_order_takes_components_by_their_names(tmp_path):
+    source = as_vtu(tmp_path, of_components("S{}", OF_XDMF, "123"))
+    assert read(source, stress="S", stress_order=FULL).stress[2].max() == pytest.approx(2 * IN_SPACE)
+
+
+def test_components_that_are_missing_or_stand_twice_are_refused(tmp_path):
+    part = as_vtu(tmp_path / "part", of_components("s_{}", ("xx", "yy", "zz", "xy", "yz")))
+    with pytest.raises(DatasetError, match="of the components of 's', xz are missing; there are s_xx, s_yy, s_zz"):
+        read(part, stress="s")
+    twice = as_vtu(tmp_path / "twice", of_components("S{}") | of_components("S{}", ("xx",), "123"))
+    with pytest.raises(DatasetError, match="the component xx of 'S' is 'Sxx' and 'S11'|is 'S11' and 'Sxx'"):
+        read(twice, stress="S")
+    pairs = as_vtu(tmp_path / "pairs", of_components("s_{}") | {"s_xy": lambda frame: np.ones((NODES, 2))})
+    with pytest.raises(DatasetError, match="the field 's_xy' must have one number in each row"):
+        read(pairs, stress="s")
+    one = as_vtu(tmp_path / "one", of_components("s_{}"))
+    with pytest.raises(DatasetError, match="'s_xy' is one component of a stress: name what all have, 's'"):
+        read(one, stress="s_xy")
+    with pytest.raises(DatasetError, match="no field 'sig'; .*is named by what these have in common: 's'"):
+        read(one, stress="sig")
+    assert stems_of(["displacement_x", "displacement_y", "displacement_z", "S_Mises", "max", "fix"]) == []
+
+
+def test_a_frame_that_lacks_a_component_is_refused(tmp_path):
+    source = as_vtu(tmp_path, of_components("s_{}"))
+    mesh = meshio.read(source / "f_2.vtu")
+    del mesh.point_data["s_yz"]
+    mesh.write(source / "f_2.vtu")
+    with pytest.raises(DatasetError, match=r"f_2.vtu: of the components of 's', yz are missing"):
+        read(source, stress="s")
 
 
 def test_a_stress_at_points_and_in_cells_is_told(tmp_path):

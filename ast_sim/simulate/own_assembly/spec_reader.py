@@ -8,9 +8,8 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-import meshio
-
 from ast_sim.dataset.layout import LENGTH_UNITS
+from ast_sim.importers.frames_in_file import is_of_known_kind
 from ast_sim.importers.places import Place, parse_places
 from ast_sim.simulate.own_assembly.assembly_spec import (
     CAD_ENDINGS,
@@ -300,12 +299,11 @@ def _check_used(spec: AssemblySpec, free: dict[str, Parameter]) -> None:
 
 
 def _check_files(spec: AssemblySpec) -> None:
-    known = {*CAD_ENDINGS, *SCRIPT_ENDINGS, STL_ENDING, *meshio.extension_to_filetypes}
     for part in spec.parts:
         for name in part.files:
             path = spec.file(name)
             suffix = path.suffix.lower()
-            if suffix not in known:
+            if suffix not in (*CAD_ENDINGS, *SCRIPT_ENDINGS) and not is_of_known_kind(path):
                 raise ConfigError(f"parts.{part.name}.file: {name} is no STEP, IGES, BREP, STL, mesh, .geo or .py file")
             if not path.is_file():
                 raise ConfigError(f"parts.{part.name}.file: there is no file {path}")

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
-import io
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-import meshio
 import numpy as np
 
 from ast_sim.importers.formats.stl_file import BadSurface
+from ast_sim.importers.frames_in_file import is_of_known_kind
+from ast_sim.importers.mesh_file import read_mesh
 from ast_sim.simulate.shapes.cad import gmsh_process, grammar
 from ast_sim.simulate.shapes.cad.surface_mend import stl_surface
 from ast_sim.simulate.shapes.mesh_check import SMALLEST_ANGLE, BadMesh, check_mesh, check_surface
-from ast_sim.simulate.shapes.parts import Part, draw_structured, oriented, volumes
-from ast_sim.support.errors import ConfigError, MissingExtra
+from ast_sim.simulate.shapes.parts import Part, draw_structured
+from ast_sim.support.errors import ConfigError, DatasetError, MissingExtra
 
 STEP_ENDINGS = (".step", ".stp")
 STL_ENDING = ".stl"
@@ -153,10 +152,9 @@ def _files(path: Path) -> tuple[Path, ...]:
         files = [f for f in files if f.is_file() and not f.name.startswith(".") and f.suffix.lower() not in _IGNORED]
     if not files:
         raise ConfigError(f"{path} holds no files: give a STEP, STL or mesh file, or a folder of them")
-    readable = {*STEP_ENDINGS, STL_ENDING, *meshio.extension_to_filetypes}
     for file in files:
-        if file.suffix.lower() not in readable:
-            raise ConfigError(f"{file} is no STEP, STL or mesh file: meshio does not know its ending")
+        if not _is_cad(file) and not is_of_known_kind(file):
+            raise ConfigError(f"{file} is no STEP, STL or mesh file: files of the kind {file.suffix} are not read")
         if _is_cad(file) and gmsh_process.gmsh_version() is None:
             raise MissingExtra(f'gmsh is needed to mesh {file.name} but is not installed: pip install "ast_sim[cad]"')
     return tuple(files)
@@ -179,7 +177,7 @@ def _load(paths: list[Path], nodes: int) -> list[Part]:
     Raises:
         BadMesh, MeshingFailed: the text names the file.
     """
-    parts = {i: read_mesh(path) for i, path in enumerate(paths) if not _is_cad(path)}
+    parts = {i: meshed_part(path) for i, path in enumerate(paths) if not _is_cad(path)}
     solids = [i for i in range(len(paths)) if i not in parts]
     if solids:
         left = nodes - sum(len(part.position) for part in parts.values())
@@ -204,38 +202,21 @@ def _request(path: Path) -> dict[str, str]:
     return {"stl": str(path.resolve())}
 
 
-def read_mesh(path: Path) -> Part:
-    """The tetrahedra of a mesh file, scaled to a diagonal of one. Only the corners of quadratic tetrahedra are used.
-
-    If all tetrahedra have negative volume, the file numbers their nodes the other way round, and they are turned.
+def meshed_part(path: Path) -> Part:
+    """The tetrahedra of a mesh file, as scenes have them, scaled to a diagonal of one. Only the corners of quadratic
+    tetrahedra are used.
 
     Raises:
         BadMesh: the file cannot be read or holds no tetrahedra.
     """
-    mesh = _read(path)
-    blocks = [block.data[:, :4] for block in mesh.cells if block.type in ("tetra", "tetra10")]
-    if not blocks or sum(map(len, blocks)) == 0:
-        kinds = ", ".join(sorted({block.type for block in mesh.cells})) or "nothing"
-        raise BadMesh(f"{path.name}: it holds no tetrahedra, but {kinds}")
-    used, elements = np.unique(np.concatenate(blocks), return_inverse=True)
-    if used[0] < 0 or used[-1] >= len(mesh.points):
-        raise BadMesh(f"{path.name}: a tetrahedron refers to a node that is not there (there are {len(mesh.points)})")
-    position = np.asarray(mesh.points, float)[used]
+    try:
+        mesh = read_mesh(path, corners=True)
+    except DatasetError as error:
+        raise BadMesh(str(error).replace(str(path), path.name, 1)) from error
+    if mesh.elements.shape[1] == 3:
+        raise BadMesh(f"{path.name}: it holds no tetrahedra, but {', '.join(mesh.source.counts())}")
+    used, elements = np.unique(mesh.elements, return_inverse=True)
+    position = mesh.points[used]
     elements = elements.reshape(-1, 4)
-    if position.shape[1] != 3:
-        raise BadMesh(f"{path.name}: its nodes have {position.shape[1]} coordinates, not 3")
-    if (volumes(position, elements) < 0).all():
-        elements = oriented(position, elements)
     check_mesh(position, elements, path.name)
     return Part(position / np.linalg.norm(np.ptp(position, axis=0)), elements, path.name)
-
-
-def _read(path: Path) -> meshio.Mesh:
-    said = io.StringIO()
-    try:
-        # meshio prints what is wrong and ends the process.
-        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
-            return meshio.read(path)
-    except (Exception, SystemExit) as error:
-        text = " ".join((said.getvalue() or str(error) or type(error).__name__).split())
-        raise BadMesh(f"{path.name}: it cannot be read: {text}") from error

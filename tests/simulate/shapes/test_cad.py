@@ -9,7 +9,7 @@ import pytest
 
 from ast_sim.simulate.shapes.cad import gmsh_process, grammar
 from ast_sim.simulate.shapes.mesh_check import BadMesh, check_mesh
-from ast_sim.simulate.shapes.part_source import GrammarParts, StructuredParts, part_source, read_mesh
+from ast_sim.simulate.shapes.part_source import GrammarParts, StructuredParts, meshed_part, part_source
 from ast_sim.simulate.shapes.parts import rectilinear, volumes
 from ast_sim.support.errors import ConfigError, MissingExtra, SimulationError
 
@@ -169,7 +169,7 @@ def test_mesh_files_of_other_programs(files, tmp_path, ending):
     points, elements = source.points * 1000, source.cells_dict["tetra"]
     path = tmp_path / f"part.{ending}"
     meshio.write(path, meshio.Mesh(np.concatenate([points, [[0, 0, 9.0]]]), [("tetra", elements[:, [0, 2, 1, 3]])]))
-    part = read_mesh(path)  # numbered the other way round, with a node that nothing uses
+    part = meshed_part(path)  # numbered the other way round, with a node that nothing uses
     assert len(part.elements) == len(elements)
     assert volumes(part.position, part.elements).min() > 0
 
@@ -181,7 +181,7 @@ def test_quadratic_tetrahedra_keep_their_corners(tmp_path):
     extra = len(position) + np.arange(6 * len(elements)).reshape(-1, 6)
     mesh = meshio.Mesh(np.concatenate([position, middle.reshape(-1, 3)]), [("tetra10", np.hstack([elements, extra]))])
     meshio.write(tmp_path / "quadratic.vtu", mesh)
-    part = read_mesh(tmp_path / "quadratic.vtu")
+    part = meshed_part(tmp_path / "quadratic.vtu")
     assert len(part.position) == 27 and np.allclose(part.position * np.sqrt(3), position)
 
 
@@ -229,11 +229,18 @@ def test_broken_mesh_files_are_refused(tmp_path, files):
     elements = mesh.cells_dict["tetra"].copy()
     elements[7] = elements[7, [1, 0, 2, 3]]
     meshio.write(tmp_path / "inverted.vtu", meshio.Mesh(mesh.points, [("tetra", elements)]))
-    assert "1 inverted tetrahedron: element 7 (nodes [" in refusal(tmp_path / "inverted.vtu")
+    part_source(tmp_path / "inverted.vtu").check()  # turned over, as in every other scene
     meshio.write(tmp_path / "surface.vtu", meshio.Mesh(mesh.points, [("triangle", elements[:, :3])]))
     assert "holds no tetrahedra, but triangle" in refusal(tmp_path / "surface.vtu")
     (tmp_path / "cut.msh").write_bytes(files["msh"].read_bytes()[:500])
     assert "cannot be read" in refusal(tmp_path / "cut.msh")
+    meshio.write(tmp_path / "plain.bdf", mesh, file_format="nastran")
+    text = (tmp_path / "plain.bdf").read_text()
+    (tmp_path / "system.bdf").write_text(text.replace("BEGIN BULK", "BEGIN BULK\nGRDSET,,5"))
+    assert "holds a GRDSET with a coordinate system of its own" in refusal(tmp_path / "system.bdf")
+    with pytest.raises(ConfigError, match="zones.tec is no STEP, STL or mesh file: files of the kind .tec are not"):
+        (tmp_path / "zones.tec").write_text("")
+        part_source(tmp_path / "zones.tec")
     (tmp_path / "empty.step").write_text("ISO-10303-21;\n")
     assert refusal(tmp_path / "empty.step")
 
