@@ -212,7 +212,7 @@ def _add_convert(convert: Parser) -> None:
     }
     add_each(kind, numbers, type=float, default=0.0)
     add_each(kind, {"--length-unit UNIT": "unit of length: m, cm, mm, um or in (default: m; a deck needs it)"})
-    about = "unit of stress and of Young's modulus: Pa, kPa, MPa, GPa or psi (default: Pa; a deck needs it)"
+    about = "unit of stress, of young and of yield_stress: Pa, kPa, MPa, GPa or psi (default: Pa; a deck needs it)"
     add_each(kind, {"--stress-unit UNIT": about})
     records = convert.add_argument_group("selection from .tfrecord files (meta.json has all other facts)")
     about = "convert only these files (default: all)"

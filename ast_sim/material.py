@@ -15,6 +15,7 @@ from ast_sim.support.errors import ConfigError
 YOUNG, POISSON, FRICTION = "young", "poisson", "friction"
 ELASTIC = (YOUNG, POISSON)  # Young's modulus in pascal, Poisson's ratio
 YIELD_STRESS = "yield_stress"  # with this column a body yields, and its law is none that is known here
+PRESSURES = (YOUNG, YIELD_STRESS)  # columns in pascal
 
 
 @dataclass(frozen=True)

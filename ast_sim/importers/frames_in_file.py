@@ -123,13 +123,16 @@ def _xdmf_frames(path: Path) -> Iterator[SourceMesh]:
     named = ", ".join(dict.fromkeys(one.get("Name", "without a name") for one in tree.iter("Set")))
     sets = [f"sets are not read: {named}"] if named else []
     time, timed = (None, False) if series else _without_time(path, tree)
-    with _beside(path, tree, _with_grid_types(tree) or timed) as copy:
-        if not series:
-            mesh = by_meshio(path, copy)
-            yield replace(mesh, time=time, notes=[*mesh.notes, *sets])
-            return
+    if series:
         _require_plain(path, series)
         _require_no_other(path, tree, series[0])
+    changes = [_with_defaults(tree), _with_references(path, tree), timed]
+    with _beside(path, tree, any(changes)) as copy:
+        if not series:
+            mesh = by_meshio(path, copy)
+            _require_count(mesh, tree.find(".//Topology"))
+            yield replace(mesh, time=time, notes=[*mesh.notes, *sets])
+            return
         try:
             with meshio.xdmf.TimeSeriesReader(copy) as reader:
                 shared = reader.read_points_cells()
@@ -140,11 +143,21 @@ def _xdmf_frames(path: Path) -> Iterator[SourceMesh]:
                     values: Any = cell_data
                     frame = meshio.Mesh(np.asarray(points), cells, point_data, values)
                     mesh = from_meshio(frame, path)
+                    topology = grid.find("Topology")
+                    _require_count(mesh, tree.find(".//Topology") if topology is None else topology)
                     yield replace(mesh, time=float(time), notes=[*mesh.notes, *sets])
         except DatasetError:
             raise
         except (Exception, SystemExit) as error:
             raise DatasetError(f"{path}: cannot be read as a mesh: {what_meshio_says(error)}") from error
+
+
+def _require_count(mesh: SourceMesh, topology: ET.Element | None) -> None:
+    """Raise DatasetError if a topology says another number of cells than its array has."""
+    said = "" if topology is None else topology.get("NumberOfElements", topology.get("Dimensions", ""))
+    cells = sum(len(block.nodes) for block in mesh.blocks)
+    if said.isdigit() and int(said) != cells:
+        raise DatasetError(f"{mesh.path}: says that it holds {said} cells, but their array has {cells}")
 
 
 def _without_time(path: Path, tree: ET.ElementTree[Any]) -> tuple[float | None, bool]:
@@ -159,12 +172,36 @@ def _without_time(path: Path, tree: ET.ElementTree[Any]) -> tuple[float | None, 
         raise DatasetError(f"{path}: the Time of its grid has no Value that is a number") from error
 
 
-def _with_grid_types(tree: ET.ElementTree[Any]) -> bool:
-    """Write out that a grid is uniform where it says no type; meshio needs that. Whether there is such a grid."""
-    plain = [grid for grid in tree.iter("Grid") if grid.get("GridType") is None]
-    for grid in plain:
-        grid.set("GridType", "Uniform")
-    return bool(plain)
+def _with_defaults(tree: ET.ElementTree[Any]) -> bool:
+    """Write out what XDMF takes where nothing is said, and meshio needs: uniform grids, fields of nodes. Whether there
+    is such a place."""
+    defaults = [("Grid", "GridType", "Uniform"), ("Attribute", "Center", "Node")]
+    silent = [(one, key, value) for tag, key, value in defaults for one in tree.iter(tag) if one.get(key) is None]
+    for one, key, value in silent:
+        one.set(key, value)
+    return bool(silent)
+
+
+def _with_references(path: Path, tree: ET.ElementTree[Any]) -> bool:
+    """Put what is referred to in the place of each reference; meshio knows them within numbers alone. Whether there is
+    one."""
+    places = [(parent, row) for parent in tree.iter() for row, one in enumerate(parent) if one.get("Reference")]
+    targets = [_referred(path, tree, parent[row]) for parent, row in places]
+    for (parent, row), target in zip(places, targets, strict=True):
+        parent[row] = target
+    return bool(places)
+
+
+def _referred(path: Path, tree: ET.ElementTree[Any], item: ET.Element) -> ET.Element:
+    """What an item refers to, which must not refer to something itself."""
+    named = item.get("Reference", "")
+    named = (item.text or "" if named == "XML" else named).strip()
+    target = None
+    with contextlib.suppress(SyntaxError, KeyError, TypeError):  # no path as ElementTree knows them
+        target = tree.getroot().find("." + (named if named.startswith("//") else named.removeprefix("/Xdmf")))
+    if target is None or target.tag != item.tag or any(one.get("Reference") for one in target.iter()):
+        raise DatasetError(f"{path}: refers to {named!r}, which it does not hold: write it out")
+    return target
 
 
 def _own_mesh(reader: Any, grid: ET.Element, shared: tuple[Any, Any]) -> tuple[Any, Any]:
@@ -182,6 +219,13 @@ def _require_understood(path: Path, tree: ET.ElementTree[Any]) -> None:
     for item in tree.iter("DataItem"):
         if item.get("ItemType", "Uniform") != "Uniform":
             raise DatasetError(f"{path}: has numbers of the type {item.get('ItemType')}; must be plain ones (Uniform)")
+    for attribute in tree.iter("Attribute"):
+        center = attribute.get("Center", "Node")
+        if center not in ("Node", "Cell"):
+            raise DatasetError(
+                f"{path}: the field {attribute.get('Name')!r} has its values at the place {center!r}: write them at the"
+                " nodes or in the cells (in FEniCS by write, not by write_checkpoint)"
+            )
     for topology in tree.iter("Topology"):
         if topology.get("BaseOffset", "0").strip() not in ("", "0"):
             raise DatasetError(

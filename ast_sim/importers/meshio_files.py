@@ -82,6 +82,20 @@ def _require_cartesian(path: Path) -> None:
                 raise DatasetError(f"{path}: the coordinates of {name} are not along x, y and z: write Cartesian ones")
 
 
+def _require_entries_of_dolfin(path: Path) -> None:
+    """Raise DatasetError unless an XML file of DOLFIN has each vertex and each cell that it counts: meshio takes what
+    stands in the memory for the others."""
+    content = path.read_bytes()
+    for plural, single in ((b"vertices", rb"vertex"), (b"cells", rb"(?:triangle|tetrahedron|interval)")):
+        size = re.search(rb"<%s\b[^>]*?\bsize\s*=\s*[\"'](\d+)" % plural, content)
+        entries = {*map(int, re.findall(rb"<%s\b[^>]*?\bindex\s*=\s*[\"'](\d+)" % single, content))}
+        if size and (len(entries) != int(size[1]) or max(entries, default=-1) + 1 != len(entries)):
+            raise DatasetError(
+                f"{path}: says that it holds {int(size[1])} {plural.decode()}, but has {len(entries)} of them: it is"
+                " damaged"
+            )
+
+
 def _require_cells_of_ansys(path: Path) -> None:
     """Raise DatasetError if a .msh file is none that meshio has written: Fluent lists the faces of cells, which meshio
     takes for triangles."""
@@ -138,6 +152,7 @@ _CHECKS: dict[str, Callable[[Path], None]] = {
     ".med": _require_cartesian,
     ".msh": _require_cells_of_ansys,
     ".ply": _require_header_of_ply,
+    ".xml": _require_entries_of_dolfin,
     **dict.fromkeys((".off", ".node", ".ele"), _require_first_line),
     **dict.fromkeys(_NASTRAN, _require_plain_cards),
 }

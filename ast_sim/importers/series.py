@@ -28,7 +28,8 @@ from ast_sim.importers.solids.positions import far_origin, rest_and_position, wa
 from ast_sim.importers.solids.stitching import Stitching
 from ast_sim.importers.solved_jobs.job import Job, read_job
 from ast_sim.importers.solved_jobs.job_results import job_frames
-from ast_sim.importers.stress import STRESS_UNITS, of_components, order_of, stem_of, stems_of, von_mises
+from ast_sim.importers.stress import STRESS_UNITS, of_components, order_of, stress_place, von_mises
+from ast_sim.material import PRESSURES
 from ast_sim.plausibility.axes import MIRRORED
 from ast_sim.scene import NodeType, Scene, Trajectory
 from ast_sim.support.argument_checks import several
@@ -55,7 +56,7 @@ class FieldNames:
             field E and calls the column young; `ast_sim.Material` says which names have a meaning.
         stress_order: the components that the columns of the stress hold, such as ("xx", "xy", "xz", "yy", "yz", "zz").
             Empty: as the file names them; else the normal stresses come first. Six columns in XDMF need it.
-        stress_unit: the unit of the stress, and of Young's modulus in a deck: one of `STRESS_UNITS`; None is pascal.
+        stress_unit: the unit of the stress, and of a young and a yield_stress in the material; None is pascal.
         fields: further point or cell fields, as NAME or NAME=UNIT, that become named fields of the dataset.
         reaction: point field, the forces that act on the nodes from outside.
         newton: the unit of these forces in newton.
@@ -138,7 +139,7 @@ def read_series(
         scene,
         rest_position=(rest - origin).astype(np.float32),
         node_type=types,
-        material=mesh.columns(names.material_fields),
+        material=_material(mesh, names, job is not None),
     )
     stress, more = _stress(mesh, kept, used, place, scene, _pascals(names))
     rigid = {at: ~scene.deforming(at) for at in ("node", "element")}
@@ -184,7 +185,7 @@ def _read_frames(
         if first is None or stitching is None:
             first = frame
             stitching = Stitching(frame)
-            place, order, notes = _stress_place(frame, names)
+            place, order, notes = stress_place(frame, names.stress, names.stress_order)
         frame, said = in_order_of(frame, first, kept.points[-1] if kept.points else first.points)
         notes += said
         cells = order_of_cells(frame, first)
@@ -260,31 +261,6 @@ def _pascals(names: FieldNames) -> float:
     return STRESS_UNITS[names.stress_unit or "Pa"]
 
 
-def _stress_place(frame: SourceMesh, names: FieldNames) -> tuple[str, tuple[str, ...], list[str]]:
-    """Where a file holds the stress ("none", "node" or "element"), the components of its columns, and a note on
-    them."""
-    name = names.stress or "von_mises"
-    place = "node" if name in frame.point_fields else "element" if name in frame.cell_fields else "none"
-    if place == "none":
-        if names.stress is not None:
-            known = sorted({*frame.point_fields, *frame.cell_fields})
-            stems = " or ".join(map(repr, stems_of(known)))
-            parts = f"; a stress whose components are fields is named by what these have in common: {stems}"
-            listed = ", ".join(known) or "none"
-            told = f"there is no field {names.stress!r}; there are: {listed}{parts if stems else ''}"
-            raise DatasetError(f"{frame.path}: {told}")
-        return place, (), []
-    whole = stem_of(name, [*frame.point_fields, *frame.cell_fields])
-    if whole:
-        raise DatasetError(f"{frame.path}: {name!r} is one component of a stress: name what all have, {whole!r}")
-    values = raw_field(frame, "point" if place == "node" else "cell", name)
-    order = order_of(frame.path, name, values, frame.columns.get(name, ()), names.stress_order)
-    both = name in frame.point_fields and name in frame.cell_fields
-    notes = [f"{name!r} is a field of points and one of cells: the one of points is taken"] if both else []
-    computed = f"the von Mises stress is computed from the components {', '.join(order)} of {name!r}"
-    return place, order, [*notes, computed] if order else notes
-
-
 def _stress(
     mesh: MeshFile, kept: KeptFrames, used: np.ndarray, place: str, scene: Scene, pascals: float
 ) -> tuple[np.ndarray | None, list[str]]:
@@ -301,6 +277,15 @@ def _stress(
         return stress, []
     stress[:, lacking] = 0
     return stress, [f"the stress is NaN at {lacking.sum()} rows of obstacles: it is 0 there"]
+
+
+def _material(mesh: MeshFile, names: FieldNames, of_job: bool) -> np.ndarray | None:
+    """[E, m] float32: the material; pressures are in pascal, in the one of a job already."""
+    columns = mesh.columns(names.material_fields)
+    if columns is None or of_job:
+        return columns
+    units = [_pascals(names) if name in PRESSURES else 1.0 for name in names.material_columns]
+    return columns * np.array(units, np.float32)
 
 
 def _rest_and_position(

@@ -12,6 +12,7 @@ import numpy as np
 
 from ast_sim.importers.formats.source_mesh import SourceMesh
 from ast_sim.importers.frames_in_file import XDMF
+from ast_sim.importers.mesh_file import raw_field
 from ast_sim.support.errors import ConfigError, DatasetError
 
 # Where the six components stand if nobody says so: the three normal stresses, then the shear stresses. CalculiX, VTK,
@@ -183,6 +184,36 @@ def _held(path: Path, name: str, fields: dict[str, np.ndarray]) -> dict[str, tup
     for part in [*held]:
         held.setdefault(part[::-1], held[part])
     return held
+
+
+def stress_place(
+    frame: SourceMesh, stress: str | None, given: tuple[str, ...]
+) -> tuple[str, tuple[str, ...], list[str]]:
+    """Where a file holds the stress ("none", "node" or "element"), the components of its columns, and notes on them.
+
+    Raises:
+        DatasetError: there is no field of this name, or it is none of a whole stress; the text names what there is.
+    """
+    name = stress or "von_mises"
+    place = "node" if name in frame.point_fields else "element" if name in frame.cell_fields else "none"
+    if place == "none":
+        if stress is not None:
+            known = sorted({*frame.point_fields, *frame.cell_fields})
+            stems = " or ".join(map(repr, stems_of(known)))
+            parts = f"; a stress whose components are fields is named by what these have in common: {stems}"
+            listed = ", ".join(known) or "none"
+            told = f"there is no field {stress!r}; there are: {listed}{parts if stems else ''}"
+            raise DatasetError(f"{frame.path}: {told}")
+        return place, (), []
+    whole = stem_of(name, [*frame.point_fields, *frame.cell_fields])
+    if whole:
+        raise DatasetError(f"{frame.path}: {name!r} is one component of a stress: name what all have, {whole!r}")
+    values = raw_field(frame, "point" if place == "node" else "cell", name)
+    order = order_of(frame.path, name, values, frame.columns.get(name, ()), given)
+    both = name in frame.point_fields and name in frame.cell_fields
+    notes = [f"{name!r} is a field of points and one of cells: the one of points is taken"] if both else []
+    computed = f"the von Mises stress is computed from the components {', '.join(order)} of {name!r}"
+    return place, order, [*notes, computed] if order else notes
 
 
 def von_mises(values: np.ndarray, order: tuple[str, ...]) -> np.ndarray:

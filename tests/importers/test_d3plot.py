@@ -159,3 +159,23 @@ def test_states_that_are_missing_or_cut_off_are_refused(tmp_path, damage, cause)
 
 def shorten(file):
     file.write_bytes(file.read_bytes()[:-240])
+
+
+@pytest.mark.parametrize("dead", [None, 0, 3])
+@pytest.mark.parametrize("when", [1, 2])
+def test_elements_that_are_deleted_are_refused(tmp_path, dead, when):
+    """A table at the end of each state has 0 for them; a maximum of -10,003 layers says that it is there."""
+    path = write(tmp_path, COLUMN, CUBES, [1, 1, 1, 1], pressed(COLUMN), stresses(4))
+    control = np.fromfile(path, "<i4")
+    control[36] = -10003
+    control.tofile(path)
+    states = np.fromfile(tmp_path / "d3plot01", "<f4")
+    alive = np.ones((3, 4), "<f4")
+    alive[when:, dead if dead is not None else []] = 0
+    states = np.column_stack([states[:-1].reshape(3, -1), alive]).ravel()
+    np.append(states, states.dtype.type(-999999)).tofile(tmp_path / "d3plot01")
+    if dead is None:
+        assert read_series(path, NAMES).scene.num_elements == 24
+        return
+    with pytest.raises(DatasetError, match=f"d3plot: 1 elements are deleted at the time {TIMES[when]:g}, but all"):
+        read_series(path, NAMES)

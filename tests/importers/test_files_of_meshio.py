@@ -1,5 +1,7 @@
 """Kinds of files that meshio reads in part, or looks at without end: read whole, or refused."""
 
+import re
+
 import meshio
 import numpy as np
 import pytest
@@ -21,7 +23,8 @@ def volume(mesh):
 
 
 @pytest.mark.parametrize(
-    "name", ["a.mesh", "a.meshb", "a.med", "a.vol", "a.node", "a.bdf", "a.avs", "a.f3grid", "a.b8.ugrid", "a.xdmf"]
+    "name",
+    ["a.mesh", "a.meshb", "a.med", "a.vol", "a.node", "a.bdf", "a.avs", "a.f3grid", "a.b8.ugrid", "a.xdmf", "a.xml"],
 )
 def test_kinds_that_are_read_keep_points_and_elements(tmp_path, name):
     meshio.Mesh(POINTS, [("tetra", CUBE.elements)]).write(tmp_path / name)
@@ -46,6 +49,24 @@ def test_kinds_that_meshio_reads_in_part_are_refused(tmp_path, name):
     (tmp_path / name).write_text("VARIABLES = X Y Z\n")
     with pytest.raises(DatasetError, match=f"{name}: .* files of the kind .* are not read; write it as .vtu, .vtk"):
         read_mesh(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "cause"),
+    [
+        (r'<vertex index="7".*', "", "says that it holds 8 vertices, but has 7 of them"),
+        (r'<tetrahedron index="2".*', "", "says that it holds 6 cells, but has 5 of them"),
+        (r'<tetrahedron index="2"', '<tetrahedron index="3"', "says that it holds 6 cells, but has 5 of them"),
+        (r'<vertices size="8"', '<vertices size="900000000000"', "says that it holds 900000000000 vertices, but has 8"),
+    ],
+)
+def test_files_of_dolfin_that_lack_an_entry_are_refused(tmp_path, old, new, cause):
+    """meshio takes what stands in the memory for what is missing."""
+    path = tmp_path / "a.xml"
+    meshio.Mesh(POINTS, [("tetra", CUBE.elements)]).write(path)
+    path.write_text(re.sub(old, new, path.read_text()))
+    with pytest.raises(DatasetError, match=f"a.xml: {cause}"):
+        read_mesh(path)
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """Jobs of CalculiX whose nodes are moved, whose steps end or whose rest is other than in the common ones."""
 
+import re
 import shutil
 from dataclasses import replace
 
@@ -165,3 +166,95 @@ def test_increments_that_do_not_follow_each_other_in_time_are_refused(tmp_path):
         DatasetError, match=r"the increment at the time 0\.\d stands after the one at 1: let the time go on"
     ):
         read(solved(tmp_path, cube(*reset)))
+
+
+# The nodes of the faces of a tetrahedron, as CalculiX counts them.
+FACES = ((0, 1, 2), (0, 3, 1), (1, 3, 2), (2, 3, 0))
+
+
+def faces(height, first):
+    """The faces of the cube at a height; `first` is the number of its first element."""
+    flat = [
+        (e, f)
+        for e, row in enumerate(CUBE.elements)
+        for f, face in enumerate(FACES)
+        if (HEIGHT[row[list(face)]] == height).all()
+    ]
+    return [f"{first + element}, S{1 + face}" for element, face in flat]
+
+
+def upper_cube(gap, *constraint):
+    """A second cube over the first, with a gap; its nodes are numbered from 101 on."""
+    nodes = [f"{101 + n}, {x:g}, {y:g}, {2 + gap + z:g}" for n, (x, y, z) in enumerate(CUBE.rest_position)]
+    elements = [", ".join(map(str, [1001 + n, *(row + 101)])) for n, row in enumerate(CUBE.elements)]
+    lines = ["*NODE", *nodes, "*ELEMENT, TYPE=C3D4, ELSET=UP", *elements, "*SOLID SECTION, ELSET=UP, MATERIAL=M"]
+    lines += ["*NSET, NSET=LID", *(str(101 + node) for node in np.flatnonzero(HEIGHT == 2))]
+    lines += ["*SURFACE, NAME=LOW", *faces(2, 1), "*SURFACE, NAME=NODES, TYPE=NODE"]
+    lines += [str(101 + node) for node in np.flatnonzero(HEIGHT == 0)]
+    return [*lines, *constraint]
+
+
+@pytest.mark.parametrize(
+    ("constraint", "moved"),
+    [
+        (["*TIE, NAME=T, POSITION TOLERANCE=0.5", "NODES, LOW"], True),
+        (["*TIE, NAME=T, POSITION TOLERANCE=0.5, ADJUST=NO", "NODES, LOW"], False),
+        (
+            ["*SURFACE INTERACTION, NAME=I", "*SURFACE BEHAVIOR, PRESSURE-OVERCLOSURE=LINEAR", "1e4"]
+            + ["*CONTACT PAIR, INTERACTION=I, TYPE=NODE TO SURFACE, ADJUST=0.1", "NODES, LOW"],
+            True,
+        ),
+    ],
+    ids=["tie", "tie as it is", "contact"],
+)
+def test_nodes_that_calculix_adjusts_stand_as_in_the_results(tmp_path, constraint, moved):
+    press = step("*BOUNDARY", "LID, 1, 2", "LID, 3, 3, -0.1")
+    job = solved(tmp_path, cube(press, model=upper_cube(0.05, *constraint)))
+    result = read(job)
+    low = result.scene.rest_position[27:][HEIGHT == 0, 2]
+    np.testing.assert_allclose(low, 2 if moved else 2.05, atol=1e-5)
+    np.testing.assert_allclose(result.position[0], result.scene.rest_position, atol=1e-6)
+    assert ("9 nodes stand where CalculiX has put them at rest (*" in result.attributes["notes"]) == moved
+    if moved:  # without the keyword, the deck is another one
+        job[0].write_text(
+            job[0].read_text().replace("ADJUST=0.1", "SMALL SLIDING").replace("*TIE,", "*TIE, ADJUST=NO,")
+        )
+        with pytest.raises(DatasetError, match="holds results of another deck than job.inp: node 101 is off by 0.05"):
+            read(job)
+
+
+def test_many_nodes_elsewhere_are_another_deck_whatever_is_adjusted(tmp_path):
+    tie = ["*TIE, NAME=T, POSITION TOLERANCE=0.5", "NODES, LOW"]
+    job = solved(tmp_path, cube(step(*moved(-0.1)), model=upper_cube(0.05, *tie)))
+    elsewhere = re.sub(r"^(\d+, [^,]+, [^,]+), [^,]+$", r"\1, 9", job[0].read_text(), flags=re.MULTILINE)
+    job[0].write_text(elsewhere)
+    with pytest.raises(DatasetError, match="holds results of another deck than job.inp"):
+        read(job)
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (["*CHANGE MATERIAL, NAME=M", "*CHANGE PLASTIC", "60., 0.", "80., 0.5"], "has *CHANGEPLASTIC"),
+        (["*CHANGE SOLID SECTION, ELSET=ALL, MATERIAL=OTHER"], "changes the material of 48 elements in a later step"),
+    ],
+)
+def test_a_material_that_changes_in_a_later_step_is_none(tmp_path, change, told):
+    """The change is of the material that it names, not of the last one in the deck."""
+    model = ["*MATERIAL, NAME=OTHER", "*ELASTIC", "500., 0.2"]
+    steps = step(*moved(-0.1)), step(*change, *moved(-0.1))
+    result = read(solved(tmp_path, cube(*steps, model=model, material=["*PLASTIC", "30., 0.", "40., 0.5"])))
+    assert result.scene.material is None and told in result.attributes["notes"]
+
+
+def test_displacements_at_the_start_are_no_rest(tmp_path):
+    """The frame before the results has none; velocities are told."""
+
+    def job(folder, kind):
+        model = [f"*INITIAL CONDITIONS, TYPE={kind}", "TOP, 3, -0.05"]
+        wave = step(procedure="*DYNAMIC, DIRECT")
+        return solved(tmp_path / folder, cube(wave, model=model, material=["*DENSITY", "1e-9"]))
+
+    with pytest.raises(DatasetError, match="give DISPLACEMENT, so displacement at rest is not 0"):
+        read(job("moved", "DISPLACEMENT"))
+    assert "nodes move at the start (*INITIAL CONDITIONS)" in read(job("fast", "VELOCITY")).attributes["notes"]

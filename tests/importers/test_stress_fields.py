@@ -227,3 +227,36 @@ def test_two_files_of_one_number_are_told(tmp_path, copy):
     source = as_vtu(tmp_path, {})
     (source / copy).write_bytes((source / "f_1.vtu").read_bytes())
     assert "have one number: is one a copy of the other?" in notes(read(source))
+
+
+@pytest.mark.parametrize(("name", "deleted"), [("STATUS", True), ("EROSION_STATUS", True), ("STATUS", False)])
+def test_elements_that_a_field_calls_deleted_are_told(tmp_path, name, deleted):
+    alive = {name: lambda frame: np.where((np.arange(ELEMENTS) < 2) & deleted & (frame == 2), 0, 1)}
+    result = read(as_vtu(tmp_path, {}, alive))
+    told = f"the field '{name}' changes in 2 rows of f_2.vtu: are elements deleted? All are kept"
+    assert (told in notes(result)) == deleted
+
+
+@pytest.mark.parametrize("moving", [False, True])
+@pytest.mark.parametrize("first", [0, 2])
+def test_positions_that_are_named_as_the_displacement_are_refused(tmp_path, moving, first):
+    """Such as COORD of Abaqus, or the deflected coordinates of LS-DYNA; the nodes would lie twice as far out."""
+    for frame in range(3):
+        position = POINTS + pressed(frame + first)
+        mesh = meshio.Mesh(position if moving else POINTS, [("tetra", CUBE.elements)])
+        mesh.point_data = {"COORD": position + 7.0, "U": pressed(frame + first)}
+        mesh.write(tmp_path / f"f_{frame}.vtu")
+    with pytest.raises(DatasetError, match="the displacement holds positions: in the first frame it is about the poi"):
+        read(tmp_path, displacement="COORD")
+    moved = read(tmp_path, displacement="U").position
+    np.testing.assert_allclose(moved[2], POINTS + pressed(2 + first), atol=1e-6)
+
+
+@pytest.mark.parametrize(("unit", "pascals"), [(None, 1), ("MPa", 1e6), ("psi", 6894.757293168)])
+def test_the_unit_of_stress_is_the_one_of_moduli_too(tmp_path, unit, pascals):
+    made = {"E": 200.0, "nu": 0.3, "Y": 3.0, "E2": 7.0, "von_mises": 5.0}
+    source = as_vtu(tmp_path, {}, {name: (lambda _, one=one: np.full(ELEMENTS, one)) for name, one in made.items()})
+    names = ("young=E", "poisson=nu", "yield_stress=Y", "E2")
+    result = read(source, stress_unit=unit, material=names)
+    np.testing.assert_allclose(result.scene.material[0], [200 * pascals, 0.3, 3 * pascals, 7], rtol=1e-6)
+    np.testing.assert_allclose(result.stress.max(), 5 * pascals, rtol=1e-6)

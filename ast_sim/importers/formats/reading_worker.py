@@ -265,7 +265,8 @@ def _dyna(path: Path) -> _Opened:
     reader.SetFileName(_name(path))
     reader.UpdateInformation()
     reader.SetDeformedMesh(0)
-    reader.SetRemoveDeletedCells(0)
+    reader.SetRemoveDeletedCells(1)  # they stay as ghosts; without this, they are not known
+    reader.SetDeletedCellsAsGhostArray(1)
     for kind in ("Point", "Solid", "ThickShell", "Shell"):
         for index in range(getattr(reader, f"GetNumberOf{kind}Arrays")()):
             getattr(reader, f"Set{kind}ArrayStatus")(index, 1)

@@ -164,11 +164,21 @@ def from_meshio(mesh: meshio.Mesh, path: Path) -> SourceMesh:
     return SourceMesh(
         path,
         points,
-        [CellBlock(block.type, np.asarray(block.data, np.int64), block.type) for block in cells],
+        [CellBlock(block.type, _rows_of(path, block), block.type) for block in cells],
         {name: np.asarray(values) for name, values in mesh.point_data.items()},
         mesh_fields,
         _node_groups(mesh),
     )
+
+
+def _rows_of(path: Path, block: meshio.CellBlock) -> np.ndarray:
+    """[c, k]: the nodes of cells, which XDMF may have in one row."""
+    nodes = np.asarray(block.data, np.int64)
+    if nodes.ndim == 1 and len(nodes) % node_count(block.type) == 0:
+        return nodes.reshape(-1, node_count(block.type))
+    if nodes.ndim != 2:
+        raise DatasetError(f"{path}: the nodes of its {block.type} cells have the shape {nodes.shape}; must be rows")
+    return nodes
 
 
 def _node_groups(mesh: meshio.Mesh) -> dict[str, np.ndarray]:

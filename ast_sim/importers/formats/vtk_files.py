@@ -91,6 +91,8 @@ def vtk_frames(path: Path) -> Iterator[SourceMesh]:
         declared = of_steps[step] if step < len(of_steps) else head.get("declared")
         declared = declared or ([sum(column) for column in zip(*pieces, strict=True)] if pieces else None)
         _require_counts(mesh, declared)
+        if is_dyna(path):
+            _require_no_deleted(mesh)
         step += 1
         if step == steps and is_left_out(path, head.get("given_up", False), steps, head["time"]):
             return
@@ -137,6 +139,17 @@ def _require_counts(mesh: SourceMesh, declared: list[int] | None) -> None:
         raise DatasetError(
             f"{mesh.path}: says that it holds {declared[0]} points and {declared[1]} cells, but VTK reads {points} and"
             f" {cells}"
+        )
+
+
+def _require_no_deleted(mesh: SourceMesh) -> None:
+    """Raise DatasetError if elements of LS-DYNA are deleted, as where a material fails; VTK makes ghosts of them."""
+    deleted = sum(int(np.count_nonzero(np.nan_to_num(ghosts))) for ghosts in mesh.cell_fields.get("vtkGhostType", []))
+    if deleted:
+        at = "" if mesh.time is None else f" at the time {mesh.time:g}"
+        raise DatasetError(
+            f"{mesh.path}: {deleted} elements are deleted{at}, but all frames of a scene have the same ones: end the"
+            " results before"
         )
 
 

@@ -9,9 +9,13 @@ import numpy as np
 
 from ast_sim.importers.formats.source_mesh import SourceMesh
 
+# Names of cell fields by which programs say that an element is deleted, in small letters and without underlines.
+_OF_DELETED = ("status", "erosionstatus", "elementstatus", "deletionstatus", "death", "deleted", "eroded")
+
 
 class ConstantFields:
-    """Fields by name that must be the same in all frames; those that a frame does not have are not looked at."""
+    """Fields by name that must be the same in all frames, and those by which programs say that an element is deleted;
+    those that a frame does not have are not looked at."""
 
     def __init__(self, names: Iterable[str]) -> None:
         self.names = tuple(names)
@@ -20,7 +24,8 @@ class ConstantFields:
 
     def look(self, frame: SourceMesh, cells: np.ndarray | None) -> None:
         """Compare a frame with the first. `cells` are its cells in the order of the first frame; None: as it is."""
-        for name in self.names:
+        of_deleted = [name for name in frame.cell_fields if name.lower().replace("_", "") in _OF_DELETED]
+        for name in (*self.names, *of_deleted):
             if name in frame.point_fields:
                 values = frame.point_fields[name]
             elif name in frame.cell_fields:
@@ -33,10 +38,12 @@ class ConstantFields:
                 continue
             changed = ~np.isclose(values, first, rtol=1e-5, equal_nan=True).reshape(len(values), -1).all(axis=1)
             if changed.any() and name not in self.changes:
-                self.changes[name] = (
-                    f"the field {name!r} changes in {changed.sum()} rows of {frame.path.name}: the values of the first"
-                    " frame are taken"
+                taken = (
+                    "are elements deleted? All are kept"
+                    if name in of_deleted
+                    else "the values of the first frame are taken"
                 )
+                self.changes[name] = f"the field {name!r} changes in {changed.sum()} rows of {frame.path.name}: {taken}"
 
     def notes(self) -> list[str]:
         """A note on each field that changes."""

@@ -12,6 +12,9 @@ from ast_sim.support.errors import DatasetError, warn
 # Points count as equal if they differ by less than this share of the size of the mesh.
 _AGREEMENT = 1e-4
 
+# Positions in the first frame differ from the points by less than this share of their size; no body is so much wider.
+_POSITIONS = 0.25
+
 # Rounding to float32 may change the displacements by this share of the largest one before a warning is given.
 _ROUNDING = 0.01
 
@@ -32,6 +35,11 @@ def rest_and_position(
         frame = next(frame for frame, one in enumerate(displacements) if one is None)
         raise DatasetError(f"{source}: frame {frame} has no displacement, others have")
     moved = np.stack(given)
+    if np.linalg.norm(_centred(moved[0]) - _centred(at[0])) < _POSITIONS * np.linalg.norm(_centred(at[0])):
+        raise DatasetError(
+            f"{source}: the displacement holds positions: in the first frame it is about the points themselves; write"
+            " displacements, or the positions as points"
+        )
     allowed = _AGREEMENT * np.ptp(at[0], axis=0).max()
     if np.abs(at - at[0]).max() <= allowed:
         return at[0], at[0] + moved
@@ -47,6 +55,10 @@ def rest_and_position(
         f"{source}: the displacement does not fit the points: in some frame the points, and the points minus the"
         " displacement, differ from frame 0; name the right field"
     )
+
+
+def _centred(points: np.ndarray) -> np.ndarray:
+    return points - points.mean(axis=0)
 
 
 def with_layers(source: Path, shells: Shells, rest: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -58,6 +58,7 @@ class Job:
             Empty if some element has no isotropic elastic material.
         ends: the times at which the steps end.
         starts_with: what is there at rest beside a temperature, such as STRESS; see *INITIAL CONDITIONS.
+        adjusting: keywords that let CalculiX move nodes onto a surface before the first increment.
     """
 
     mesh: SourceMesh
@@ -65,6 +66,7 @@ class Job:
     materials: dict[str, list[np.ndarray]]
     ends: tuple[float, ...]
     starts_with: tuple[str, ...] = ()
+    adjusting: tuple[str, ...] = ()
 
 
 @dataclass(eq=False)
@@ -106,7 +108,22 @@ def read_job(path: Path) -> Job:
     materials, more = material_columns(deck)
     mesh.notes.extend([*conditions.notes, *more, *_not_in_a_scene(deck)])
     starts_with = [_initial(keyword) for keyword in deck.keywords if keyword.name == "INITIALCONDITIONS"]
-    return Job(mesh, _node_type(mesh, conditions), materials, _ends(deck), tuple(starts_with))
+    if "VELOCITY" in starts_with:
+        mesh.notes.append(
+            "nodes move at the start (*INITIAL CONDITIONS): in the frame at rest they stand where they are"
+        )
+    return Job(mesh, _node_type(mesh, conditions), materials, _ends(deck), tuple(starts_with), _adjusting(deck))
+
+
+def _adjusting(deck: Deck) -> tuple[str, ...]:
+    """*TIE moves nodes unless it says ADJUST=NO, *CONTACT PAIR if it says ADJUST=."""
+    names = [
+        f"*{keyword.name}" if keyword.name == "TIE" else "*CONTACT PAIR"
+        for keyword in deck.keywords
+        if (keyword.name == "TIE" and keyword.options.get("ADJUST", "").upper() != "NO")
+        or (keyword.name == "CONTACTPAIR" and "ADJUST" in keyword.options)
+    ]
+    return tuple(dict.fromkeys(names))
 
 
 def _initial(keyword: Keyword) -> str:

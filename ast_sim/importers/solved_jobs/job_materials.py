@@ -12,7 +12,15 @@ from ast_sim.importers.decks.deck_numbers import real, refuse_decimal_commas, to
 from ast_sim.importers.decks.keyword_lines import Keyword
 from ast_sim.material import ELASTIC, YIELD_STRESS
 
-MATERIAL_KEYWORDS = ("MATERIAL", "ELASTIC", "PLASTIC", "SOLIDSECTION", "DENSITY")
+MATERIAL_KEYWORDS = (
+    "MATERIAL",
+    "ELASTIC",
+    "PLASTIC",
+    "SOLIDSECTION",
+    "DENSITY",
+    "CHANGEMATERIAL",
+    "CHANGESOLIDSECTION",
+)
 
 # With these beside *ELASTIC and *PLASTIC, the material has another law.
 _OTHER_LAWS = {
@@ -47,7 +55,7 @@ def material_columns(deck: Deck) -> tuple[dict[str, list[np.ndarray]], list[str]
     blocks = [block for block in deck.root.blocks if len(block.numbers)]
     tables = [{name: np.full(len(block.numbers), np.nan) for name in COLUMNS} for block in blocks]
     for keyword in deck.keywords:
-        if keyword.name == "SOLIDSECTION":
+        if keyword.name in ("SOLIDSECTION", "CHANGESOLIDSECTION"):
             name, elements = keyword.required("MATERIAL").upper(), keyword.required("ELSET").upper()
             if name not in materials:
                 raise keyword.error(f"there is no material {keyword.options['MATERIAL']!r}")
@@ -55,6 +63,11 @@ def material_columns(deck: Deck) -> tuple[dict[str, list[np.ndarray]], list[str]
                 raise keyword.error(f"there is no set of elements {keyword.options['ELSET']!r}")
             numbers = np.concatenate([members.numbers for members in deck.root.element_sets[elements]])
             one = materials[name]
+            if keyword.name == "CHANGESOLIDSECTION":
+                one = _Material(other_law=True)
+                notes.append(
+                    f"line {keyword.line.number} changes the material of {len(numbers)} elements in a later step"
+                )
             for block, table in zip(blocks, tables, strict=True):
                 here = np.isin(block.numbers, numbers)
                 for column in COLUMNS:
@@ -76,6 +89,8 @@ def _materials(deck: Deck) -> tuple[dict[str, _Material], list[str]]:
     for keyword in deck.keywords:
         if keyword.name == "MATERIAL":
             current = materials[keyword.required("NAME").upper()] = _Material()
+        elif keyword.name == "CHANGEMATERIAL":
+            current = materials.get(keyword.required("NAME").upper(), _Material())
         elif keyword.name == "ELASTIC" and keyword.options.get("TYPE", "ISO").upper() in ("ISO", "ISOTROPIC"):
             current.young, current.poisson = _first(keyword, 2)
             if current.poisson == 0:  # 0,3

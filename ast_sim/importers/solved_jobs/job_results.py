@@ -12,13 +12,12 @@ from ast_sim.importers.formats.source_mesh import SourceMesh
 from ast_sim.importers.formats.vtk_files import vtk_frames
 from ast_sim.importers.solved_jobs.job import Job
 from ast_sim.importers.stress import order_of, von_mises
+from ast_sim.material import PRESSURES
 from ast_sim.scene import NodeType
 from ast_sim.support.errors import DatasetError, warn
 
 # The coordinates of a deck and of its results may differ by this share of the size of the mesh; results have 6 digits.
 _AGREEMENT = 1e-4
-
-_PRESSURES = ("young", "yield_stress")
 
 # What the keywords of a deck call a field, and how it is called in the results.
 _IN_RESULTS = {"PEEQ": "PE", "RF": "FORC", "NT": "NDTEMP"}
@@ -27,7 +26,12 @@ _IN_RESULTS = {"PEEQ": "PE", "RF": "FORC", "NT": "NDTEMP"}
 _TEMPERATURE = "NDTEMP"
 
 # What *INITIAL CONDITIONS of these types make of fields at rest: they are not 0.
-_AT_REST = {"STRESS": ("von_mises", "STRESS"), "PLASTICSTRAIN": ("PE",), "HARDENING": ("PE",)}
+_AT_REST = {
+    "STRESS": ("von_mises", "STRESS"),
+    "PLASTICSTRAIN": ("PE",),
+    "HARDENING": ("PE",),
+    "DISPLACEMENT": ("displacement",),
+}
 
 
 def job_frames(job: Job, results: Path, pascals: float, wanted: Sequence[str] = ()) -> Iterator[SourceMesh]:
@@ -43,7 +47,7 @@ def job_frames(job: Job, results: Path, pascals: float, wanted: Sequence[str] = 
             the rest with a temperature, which is not known at rest.
     """
     materials = {
-        name: [values * (pascals if name in _PRESSURES else 1.0) for values in parts]
+        name: [values * (pascals if name in PRESSURES else 1.0) for values in parts]
         for name, parts in job.materials.items()
     }
     ends = [f"the steps end at {', '.join(f'{end:g}' for end in job.ends)}"] if job.ends else []
@@ -51,13 +55,15 @@ def job_frames(job: Job, results: Path, pascals: float, wanted: Sequence[str] = 
     last = None
     for frame in vtk_frames(results):
         fields = {"node_type": job.node_type, **_fields(job, frame, wanted)}
+        if last is None:
+            mesh = _with_adjusted(job, frame, mesh)
         if last is None and frame.time:
             if any(_IN_RESULTS.get(name, name) == _TEMPERATURE for name in wanted):
                 raise DatasetError(f"{results}: holds no frame at rest, so the temperature there is not known")
             _require_zero_at_rest(job, results, {_IN_RESULTS.get(name, name) for name in fields})
             rest = {name: values if name == "node_type" else np.zeros_like(values) for name, values in fields.items()}
-            told = [*mesh.notes, "a frame at rest stands before the results"]
-            yield replace(mesh, point_fields=rest, time=0.0, notes=told)
+            mesh.notes.append("a frame at rest stands before the results")
+            yield replace(mesh, point_fields=rest, time=0.0)
         last = frame.time
         yield replace(mesh, point_fields=fields, time=frame.time)
     if last is not None and job.ends and last < job.ends[-1] * (1 - 1e-6):
@@ -65,6 +71,18 @@ def job_frames(job: Job, results: Path, pascals: float, wanted: Sequence[str] = 
             f"{results}: ends at the time {last:g}, but the steps of {job.mesh.path.name} end at {job.ends[-1]:g}: the"
             " job was not solved to its end, or its last increment was not written"
         )
+
+
+def _with_adjusted(job: Job, frame: SourceMesh, mesh: SourceMesh) -> SourceMesh:
+    """The mesh with the nodes that CalculiX has moved at rest where they are in the results, and a note on them."""
+    rows, there = _same_nodes(job, frame)
+    moved = _away(job, frame, rows, there)
+    if not moved.any():
+        return mesh
+    points = mesh.points.copy()
+    points[rows[moved]] = frame.points[there[moved]]
+    told = f"{moved.sum()} nodes stand where CalculiX has put them at rest ({', '.join(job.adjusting)})"
+    return replace(mesh, points=points, notes=[*mesh.notes, told])
 
 
 def _require_zero_at_rest(job: Job, results: Path, fields: set[str]) -> None:
@@ -134,14 +152,21 @@ def _same_nodes(job: Job, frame: SourceMesh) -> tuple[np.ndarray, np.ndarray]:
     missing = np.setdiff1d(deck.same_point[used], numbers)
     if len(missing):
         raise DatasetError(f"{other}: node {missing[0]} is not in it")
-    away = np.abs(deck.points[rows] - frame.points[there]).max(axis=1)
-    if away.max() > _AGREEMENT * np.ptp(deck.points[used], axis=0).max():
-        row = rows[np.argmax(away)]
-        raise DatasetError(f"{other}: node {deck.same_point[row]} is off by {away.max():g}")
+    away = _away(job, frame, rows, there)
+    if away.any() and not (job.adjusting and 2 * away.sum() < len(away)):
+        row = np.flatnonzero(away)[0]
+        off = np.abs(deck.points[rows[row]] - frame.points[there[row]]).max()
+        raise DatasetError(f"{other}: node {deck.same_point[rows[row]]} is off by {off:g}")
     counts = [sum(len(block.nodes) for block in mesh.blocks if block.dimension == 3) for mesh in (deck, frame)]
     if counts[0] != counts[1]:
         raise DatasetError(f"{other}: it has {counts[1]} elements of a volume, the deck {counts[0]}")
     return rows, there
+
+
+def _away(job: Job, frame: SourceMesh, rows: np.ndarray, there: np.ndarray) -> np.ndarray:
+    """Which of the nodes `rows` of the deck lie elsewhere than in the results, where they are the points `there`."""
+    size = np.ptp(job.mesh.points[_used(job.mesh)], axis=0).max()
+    return np.abs(job.mesh.points[rows] - frame.points[there]).max(axis=1) > _AGREEMENT * size
 
 
 def _used(mesh: SourceMesh) -> np.ndarray:
