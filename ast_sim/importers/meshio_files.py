@@ -5,7 +5,8 @@ from __future__ import annotations
 import contextlib
 import io
 import re
-from collections.abc import Callable
+import tempfile
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,9 @@ _NO_ELEMENTS = re.compile(
     r"CORD|CONM|CMASS|CELAS|CDAMP|CVISC|CTUBE|CONROD|CFAST|CWELD|CSEAM|CBEND|CBEAM3|CHBDY|CLOAD|CREEP|CAERO|CSUP|CYJOIN"
 )
 
+# Lines of OBJ files that make curves and curved surfaces.
+_CURVED_OBJ = ("cstype", "curv", "curv2", "surf")
+
 
 def by_meshio(path: Path, copy: Path | None = None) -> SourceMesh:
     """Read a file, or its copy, by meshio. On a damaged file meshio may raise any error, print, or raise SystemExit.
@@ -51,12 +55,42 @@ def by_meshio(path: Path, copy: Path | None = None) -> SourceMesh:
 
     printed = io.StringIO()
     try:
-        with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
-            mesh = meshio.read(copy or path)
+        with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed), _plain(path, copy) as file:
+            mesh = meshio.read(file)
+    except DatasetError:
+        raise
     except (Exception, SystemExit) as error:
         told = what_meshio_says(error, printed.getvalue()).replace(str(copy), str(path))
         raise DatasetError(f"{path}: cannot be read as a mesh: {told}; if it is whole, {_INSTEAD}") from error
     return from_meshio(mesh, path)
+
+
+@contextlib.contextmanager
+def _plain(path: Path, copy: Path | None) -> Iterator[Path]:
+    """What meshio shall read: the file, its copy, or a copy without what it cannot read."""
+    if copy is not None or path.suffix.lower() != ".obj":
+        yield copy or path
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        plain = Path(folder) / path.name
+        plain.write_text("\n".join(_plain_obj(path)))
+        yield plain
+
+
+def _plain_obj(path: Path) -> Iterator[str]:
+    """The corners and faces of an OBJ file, without textures, normals and colours, and without numbers that count from
+    the end."""
+    corners = 0
+    for line in path.read_text("latin-1").replace("\\\n", " ").splitlines():
+        key, *entries = line.partition("#")[0].split() or [""]
+        if key in _CURVED_OBJ or (key == "v" and len(entries) == 4 and float(entries[3]) != 1):
+            raise DatasetError(f"{path}: holds curves or curved surfaces, and those are not read; {_INSTEAD}")
+        if key == "v":
+            corners += 1
+            yield " ".join(["v", *entries[:3]])
+        elif key == "f":
+            numbers = [int(entry.partition("/")[0]) for entry in entries]
+            yield " ".join(["f", *(str(number if number > 0 else corners + 1 + number) for number in numbers)])
 
 
 def what_meshio_says(error: BaseException, printed: str = "") -> str:

@@ -183,3 +183,32 @@ def test_points_of_a_mesh_in_memory_are_rows():
     mesh.points = POINTS.ravel()
     with pytest.raises(DatasetError, match=r"its points have the shape \(24,\); must be rows of up to three"):
         read_mesh(mesh)
+
+
+TRIANGLES = np.array([(0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2)])
+CORNERS = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1.5)])
+
+
+@pytest.mark.parametrize(
+    ("corner", "face", "head"),
+    [
+        ("v {} {} {}", "f {} {} {}", ""),
+        ("v {} {} {}", "f {0}/1/1 {1}/1/1 {2}/1/1", "mtllib a.mtl\nvt 0 0\nvn 0 0 1\nusemtl x\ns off\no body\ng a"),
+        ("v {} {} {} 1.0", "f {0}//1 {1}//1 {2}//1  # c", "vn 0 0 1"),
+        ("v {} {} {} 0.5 0.5 0.5", "f {0}/1 {1}/1 \\\n{2}/1", "vt 0 0\nvt 1 1"),
+    ],
+)
+@pytest.mark.parametrize("from_end", [False, True])
+def test_surfaces_of_obj_with_textures_colours_and_numbers_from_the_end(tmp_path, corner, face, head, from_end):
+    numbers = TRIANGLES - 4 if from_end else TRIANGLES + 1
+    lines = [head, *(corner.format(*row) for row in CORNERS.tolist()), *(face.format(*row) for row in numbers.tolist())]
+    (tmp_path / "a.obj").write_text("\n".join(lines))
+    mesh = read_mesh(tmp_path / "a.obj")
+    np.testing.assert_array_equal(mesh.points[mesh.elements], CORNERS[TRIANGLES])
+
+
+@pytest.mark.parametrize("line", ["cstype bspline", "surf 0 1 0 1 1 2 3 4", "v 1 2 3 0.5"])
+def test_curved_surfaces_of_obj_are_refused(tmp_path, line):
+    (tmp_path / "a.obj").write_text(f"v 0 0 0\nv 1 0 0\nv 0 1 0\n{line}\nf 1 2 3\n")
+    with pytest.raises(DatasetError, match="a.obj: holds curves or curved surfaces, and those are not read"):
+        read_mesh(tmp_path / "a.obj")

@@ -34,6 +34,13 @@ def _results_in(entry: Path) -> Iterator[Path]:
     yield from (file for file in files if file.suffix.lower() in ONE_FRAME or holds_frames(file))
 
 
+def no_pieces(files: Iterable[Path]) -> list[Path]:
+    """The files that are whole: without pieces that another one lists, and without the second file of TetGen."""
+    whole = [file for file in files if file.suffix.lower() != ".ele" or not file.with_suffix(".node").is_file()]
+    listed = {piece for file in whole for piece in _with_listed([file]) if piece != file.resolve()}
+    return [file for file in whole if file.resolve() not in listed]
+
+
 def _with_listed(files: Iterable[Path]) -> Iterator[Path]:
     """The files, and what they list, and what that lists, in full."""
     for file in files:

@@ -12,6 +12,7 @@ import numpy as np
 from ast_sim.importers.formats.stl_file import BadSurface
 from ast_sim.importers.frames_in_file import is_of_known_kind
 from ast_sim.importers.mesh_file import read_mesh
+from ast_sim.importers.order_of_files.left_out import no_pieces
 from ast_sim.simulate.shapes.cad import gmsh_process, grammar
 from ast_sim.simulate.shapes.cad.surface_mend import stl_surface
 from ast_sim.simulate.shapes.mesh_check import SMALLEST_ANGLE, BadMesh, check_mesh, check_surface
@@ -150,6 +151,7 @@ def _files(path: Path) -> tuple[Path, ...]:
     files = sorted(path.iterdir()) if path.is_dir() else [path]
     if path.is_dir():
         files = [f for f in files if f.is_file() and not f.name.startswith(".") and f.suffix.lower() not in _IGNORED]
+        files = no_pieces(files)
     if not files:
         raise ConfigError(f"{path} holds no files: give a STEP, STL or mesh file, or a folder of them")
     for file in files:

@@ -245,6 +245,18 @@ def test_broken_mesh_files_are_refused(tmp_path, files):
     assert refusal(tmp_path / "empty.step")
 
 
+def test_a_folder_counts_no_pieces_as_parts(files, tmp_path):
+    mesh = meshio.read(files["msh"])
+    tetrahedra = [("tetra", mesh.cells_dict["tetra"])]
+    meshio.write(tmp_path / "one.node", meshio.Mesh(mesh.points, tetrahedra))  # and one.ele
+    meshio.write(tmp_path / "two_0.vtu", meshio.Mesh(mesh.points, tetrahedra))
+    points = '<PPoints><PDataArray type="Float64" NumberOfComponents="3"/></PPoints>'
+    whole = f'<PUnstructuredGrid>{points}<Piece Source="two_0.vtu"/></PUnstructuredGrid>'
+    (tmp_path / "two.pvtu").write_text(f'<VTKFile type="PUnstructuredGrid" version="0.1">{whole}</VTKFile>')
+    assert list(part_source(tmp_path).describe()["parts"]) == ["one.node", "two.pvtu"]
+    part_source(tmp_path).check()
+
+
 def test_paths_that_hold_no_parts(tmp_path):
     for path, words in ((tmp_path / "absent.step", "does not exist"), (tmp_path, "holds no files")):
         with pytest.raises(ConfigError, match=words):
