@@ -54,13 +54,14 @@ def by_meshio(path: Path, copy: Path | None = None) -> SourceMesh:
     import meshio
 
     printed = io.StringIO()
+    file = copy
     try:
         with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed), _plain(path, copy) as file:
             mesh = meshio.read(file)
     except DatasetError:
         raise
     except (Exception, SystemExit) as error:
-        told = what_meshio_says(error, printed.getvalue()).replace(str(copy), str(path))
+        told = what_meshio_says(error, printed.getvalue()).replace(str(file), str(path))
         raise DatasetError(f"{path}: cannot be read as a mesh: {told}; if it is whole, {_INSTEAD}") from error
     return from_meshio(mesh, path)
 
@@ -68,16 +69,26 @@ def by_meshio(path: Path, copy: Path | None = None) -> SourceMesh:
 @contextlib.contextmanager
 def _plain(path: Path, copy: Path | None) -> Iterator[Path]:
     """What meshio shall read: the file, its copy, or a copy without what it cannot read."""
-    if copy is not None or path.suffix.lower() != ".obj":
+    make = {".obj": _plain_obj, ".ply": _plain_ply}.get(path.suffix.lower())
+    if copy is not None or make is None:
         yield copy or path
         return
     with tempfile.TemporaryDirectory() as folder:
         plain = Path(folder) / path.name
-        plain.write_text("\n".join(_plain_obj(path)))
+        plain.write_bytes(make(path))
         yield plain
 
 
-def _plain_obj(path: Path) -> Iterator[str]:
+def _plain_ply(path: Path) -> bytes:
+    """A PLY file that calls the corners of its faces as meshio does; other programs leave out the plural."""
+    return re.sub(rb"\bvertex_index\b", b"vertex_indices", path.read_bytes(), count=1)
+
+
+def _plain_obj(path: Path) -> bytes:
+    return "\n".join(_lines_of_obj(path)).encode()
+
+
+def _lines_of_obj(path: Path) -> Iterator[str]:
     """The corners and faces of an OBJ file, without textures, normals and colours, and without numbers that count from
     the end."""
     corners = 0
@@ -164,13 +175,21 @@ def _system_of(line: str) -> str:
 
 
 def _require_header_of_ply(path: Path) -> None:
-    """Raise DatasetError unless the points of a PLY file begin with x, y and z: meshio takes other columns for them."""
+    """Raise DatasetError unless the points of a PLY file begin with x, y and z: meshio takes other columns for them; or
+    if its faces have columns behind which meshio looks for the next face."""
     header, end, _ = path.read_bytes().partition(b"end_header")
     vertex = re.search(rb"element\s+vertex\s[^\n]*\n((?:\s*(?:property|comment)\b[^\n]*\n)*)", header)
     names = re.findall(rb"property\s+\S+\s+(\S+)", vertex[1]) if vertex else []
+    _, _, faces = header.partition(b"element face")
+    columns = re.findall(rb"property\s+(list)?.*?(\S+)\s*$", faces.partition(b"element")[0], re.MULTILINE)
+    further = [name.decode() for _, name in columns[1:]]
+    wrong = "" if columns[:1] and columns[0][0] else "its faces do not begin with their corners"
+    if not wrong and further and (b"format ascii" not in header or any(kind for kind, _ in columns[1:])):
+        wrong = f"its faces have further columns: write it without {', '.join(further)}"
     if not end or names[:3] != [b"x", b"y", b"z"]:
-        what = "is cut off within its header" if not end else "its points do not begin with x, y and z"
-        raise DatasetError(f"{path}: cannot be read as a mesh: {what}; {_INSTEAD}")
+        wrong = "is cut off within its header" if not end else "its points do not begin with x, y and z"
+    if wrong:
+        raise DatasetError(f"{path}: cannot be read as a mesh: {wrong}; {_INSTEAD}")
 
 
 def _require_first_line(path: Path) -> None:

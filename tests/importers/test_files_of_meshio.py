@@ -212,3 +212,39 @@ def test_curved_surfaces_of_obj_are_refused(tmp_path, line):
     (tmp_path / "a.obj").write_text(f"v 0 0 0\nv 1 0 0\nv 0 1 0\n{line}\nf 1 2 3\n")
     with pytest.raises(DatasetError, match="a.obj: holds curves or curved surfaces, and those are not read"):
         read_mesh(tmp_path / "a.obj")
+
+
+@pytest.mark.parametrize(
+    ("form", "columns", "faces", "cause"),
+    [
+        ("ascii", ["list uchar int vertex_index"], "3 {} {} {}", ""),
+        ("ascii", ["list uchar int vertex_indices", "uchar red"], "3 {} {} {} 255", ""),
+        ("ascii", ["int flags", "list uchar int vertex_indices"], "9 3 {} {} {}", "do not begin with their corners"),
+        ("ascii", ["list uchar int vertex_indices", "list uchar float uv"], "3 {} {} {} 0", "write it without uv"),
+        ("binary_little_endian", ["list uchar int vertex_index"], b"", ""),
+        ("binary_little_endian", ["list uchar int vertex_indices", "uchar red"], b"\3", "write it without red"),
+    ],
+)
+def test_faces_of_a_ply_file_are_their_corners(tmp_path, form, columns, faces, cause):
+    """Of binary files meshio takes what follows the corners of a face for the next face."""
+    head = f"ply\nformat {form} 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
+    head += "element face 4\n" + "".join(f"property {column}\n" for column in columns) + "end_header\n"
+    if form == "ascii":
+        rows = [" ".join(map(str, row)) for row in CORNERS.tolist()]
+        content = "\n".join([*rows, *(faces.format(*row) for row in TRIANGLES.tolist())]).encode()
+    else:
+        content = CORNERS.astype("<f4").tobytes()
+        content += b"".join(b"\3" + row.astype("<i4").tobytes() + faces for row in TRIANGLES)
+    (tmp_path / "a.ply").write_bytes(head.encode() + content)
+    if cause:
+        with pytest.raises(DatasetError, match=f"a.ply: cannot be read as a mesh: its faces .*{cause}; write it as"):
+            read_mesh(tmp_path / "a.ply")
+        return
+    mesh = read_mesh(tmp_path / "a.ply")
+    np.testing.assert_array_equal(mesh.points[mesh.elements], CORNERS[TRIANGLES])
+
+
+def test_a_damaged_copy_is_called_by_the_name_of_the_file(tmp_path):
+    (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1\nf 1 2 3\n")
+    with pytest.raises(DatasetError, match=re.escape(f"{tmp_path}/a.obj: cannot be read as a mesh")):
+        read_mesh(tmp_path / "a.obj")
