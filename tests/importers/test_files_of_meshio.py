@@ -244,7 +244,9 @@ def test_faces_of_a_ply_file_are_their_corners(tmp_path, form, columns, faces, c
     np.testing.assert_array_equal(mesh.points[mesh.elements], CORNERS[TRIANGLES])
 
 
-def test_a_damaged_copy_is_called_by_the_name_of_the_file(tmp_path):
-    (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1\nf 1 2 3\n")
-    with pytest.raises(DatasetError, match=re.escape(f"{tmp_path}/a.obj: cannot be read as a mesh")):
-        read_mesh(tmp_path / "a.obj")
+def test_a_copy_that_meshio_refuses_is_called_by_the_name_of_the_file(tmp_path):
+    head = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
+    columns = "property list uchar int vertex_indices\nelement edge 1\nproperty int vertex1\n"
+    (tmp_path / "a.ply").write_text(f"{head}element face 1\n{columns}end_header\n0 0 0\n3 0 0 0\n0\n")
+    with pytest.raises(DatasetError, match=re.escape(f"Couldn't read file {tmp_path}/a.ply as ply")):
+        read_mesh(tmp_path / "a.ply")
