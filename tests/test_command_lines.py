@@ -1,6 +1,6 @@
 """Command lines drawn at random from the parser itself: none ends in a traceback.
 
-250 of them are drawn; AST_SIM_COMMAND_LINES=2000 draws more. Each runs in a folder of its own that holds a dataset, a
+250 of them are drawn; AST_TEST_COMMAND_LINES=2000 draws more. Each runs in a folder of its own that holds a dataset, a
 run, meshes and files of other kinds. The long work is left out: no scene is simulated, no training step is made.
 """
 
@@ -29,7 +29,7 @@ from ast_sim.support import toml_settings
 from ast_sim.training import loop
 from ast_sim.view import export
 
-LINES = int(os.environ.get("AST_SIM_COMMAND_LINES", "250"))
+LINES = int(os.environ.get("AST_TEST_COMMAND_LINES", "250"))
 
 COMMANDS = {
     "calibrate",
@@ -220,22 +220,6 @@ def options(command: str) -> list[argparse.Action]:
     """The options of a command that take one value."""
     chosen = commands().choices[command]._actions
     return [one for one in chosen if one.option_strings and one.nargs is None and one.default != []]
-
-
-COMMANDS = [
-    "demo",
-    "generate",
-    "convert",
-    "info",
-    "train",
-    "predict",
-    "sweep",
-    "plan",
-    "evaluate",
-    "calibrate",
-    "trade",
-    "report",
-]
 
 
 @pytest.mark.parametrize("command", sorted(commands().choices))

@@ -174,16 +174,19 @@ def test_types_from_a_field_and_what_changes_them():
 
 
 def test_bodies_from_fields():
-    of_node, of_element = np.where(PLATE, 5, -2), np.where(np.arange(len(TETS)) < 768, 5, -2)
+    of_node, of_element = np.where(PLATE, 5, 2), np.where(np.arange(len(TETS)) < 768, 5, 2)
     for mesh, name in [
         (with_fields({"body": of_node}), None),
         (with_fields({"part": of_node.astype(float)}), "part"),
         (with_fields(cell={"body": of_element}), None),
         (with_fields(cell={"part": of_element}, extra=[("triangle", TETS[:2, :3])]), "part"),
     ]:
-        scene = read_scene(mesh, obstacles=[-2], body_field=name).scene
+        scene = read_scene(mesh, obstacles=[2], body_field=name).scene
         assert np.array_equal(scene.body, of_node)
         assert np.array_equal(scene.node_type, np.where(PLATE, NORMAL, OBSTACLE))
+    below = with_fields({"body": np.where(PLATE, 5, -2)})
+    with pytest.raises(DatasetError, match="node 243 is of the body -2, but bodies are numbered from 0"):
+        read_scene(below, obstacles=[-2])
 
 
 def test_materials_of_bodies_and_from_fields():
