@@ -86,6 +86,16 @@ ROWS = {
         solver_scenes=0,
         scenes="snap_hook",
     ),
+    "snap_hook_mgn": Row(
+        "Snap hook, MeshGraphNets",
+        _HOOK,
+        nodes=None,
+        train=200,
+        steps=820,
+        settings={**_SETTINGS, "peak_rate": 4e-3, "batch_size": 4, "model": "mgn"},
+        solver_scenes=0,
+        scenes="snap_hook",
+    ),
     "bumper_6000": Row(
         "Bumper, 6,000 nodes, after the small ones",
         _BUMPER,
