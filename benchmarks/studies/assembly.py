@@ -77,7 +77,7 @@ ROWS = {
     "bumper": Row("Bumper, second-order elements", _BUMPER, nodes=None, train=100, steps=1700, settings=_SETTINGS),
     "snap_hook": Row("Snap hook, second-order elements", _HOOK, nodes=None, train=200, steps=1000, settings=_SETTINGS),
     "snap_hook_transolver": Row(
-        "Snap hook, Transolver (trained beside much other work)",
+        "Snap hook, Transolver (timed beside much other work)",
         _HOOK,
         nodes=None,
         train=200,
