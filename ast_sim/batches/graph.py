@@ -51,7 +51,7 @@ class Graph:
             nodes.
         m2e: from each node to its elements; None without element nodes.
         rest_edges: [M, 4] float32, `edge_vectors` of `edges` at rest. An element is at the mean of its nodes.
-        body: [N] int64, the number of each node's body in its scene.
+        body: [N] int64, the body of each node in its scene, counted from 0 whatever numbers the scene gives them.
         surface: [F, 3] int64, boundary triangles, counter-clockwise seen from outside; None if it is not needed.
         surface_offsets: [B + 1] int64, where each scene's triangles start and end; None if they are not needed.
         elasticity: what elastic forces need; None if they are not needed.
@@ -116,7 +116,7 @@ class Graph:
             edges=edges,
             m2e=m2e,
             rest_edges=rest_edges,
-            body=torch.from_numpy(scene.body.astype("int64")),
+            body=torch.from_numpy(np.unique(scene.body, return_inverse=True)[1]),
             surface=triangles,
             surface_offsets=triangle_offsets,
             elasticity=None if elastic is None else ElasticTetrahedra.of(scene, elastic),
@@ -172,8 +172,7 @@ class Graph:
         """[N, F] -> [N, F] and [N, 1] float64: for each node the sum over the prescribed nodes of its body, and their
         number, at least 1."""
         scene = torch.arange(self.num_scenes).repeat_interleave(self.node_offsets.diff())
-        numbers = self.body.unique(return_inverse=True)[1]  # a scene may number its bodies as it likes
-        body = scene * (int(numbers.max()) + 1) + numbers
+        body = scene * (int(self.body.max()) + 1) + self.body
         counted = torch.cat([x.double(), torch.ones(len(x), 1)], dim=1) * self.prescribed[:, None]
         sums = counted.new_zeros(int(body.max()) + 1, counted.shape[1]).index_add_(0, body, counted)[body]
         return sums[:, :-1], sums[:, -1:].clamp(min=1)

@@ -19,9 +19,8 @@ from ast_sim.inference.promises.familiarity import Familiarity
 from ast_sim.inference.promises.kept_errors import DISPLACEMENT, KeptErrors
 from ast_sim.inference.promises.known_weights import require_known_weights
 from ast_sim.inference.quantities.band import LEVEL, Comparison, compared
-from ast_sim.inference.quantities.relative_errors import moves
+from ast_sim.inference.quantities.relative_errors import judging_fields, moves
 from ast_sim.inference.trained_run import Run
-from ast_sim.named_field import REACTION
 from ast_sim.runs.scope import spacing_of
 from ast_sim.scene import Trajectory
 from ast_sim.simulate.jobs.fastest_solver import deepest_frame
@@ -117,7 +116,7 @@ def _measured(run: Run, dataset: Dataset, split: str, progress: ShowProgress) ->
     to_choose = choices(run.settings.model, run.settings.train.corrections)
     efforts = to_choose if run.effort in to_choose else (*to_choose, run.effort)
     scenes: list[_Measured] = []
-    fields = [REACTION, *(name for name, *_ in run.settings.model.data.fields)]
+    fields = judging_fields(run.settings.model)
     names = [f"{split}/{index:06d}" for index in range(dataset.count(split))]
     left_out = [name for index, name in enumerate(names) if not _counts(run, dataset.load(split, index, fields), name)]
     _require_enough(len(names), len(left_out))

@@ -23,10 +23,9 @@ from ast_sim.inference.effort import Effort, choices, options_of
 from ast_sim.inference.evaluation.deepest_frames import deepest_predicted
 from ast_sim.inference.evaluation.gaussian_process import PROCESS, process_beside
 from ast_sim.inference.predicting.question import Question
-from ast_sim.inference.quantities.relative_errors import QUANTITIES, errors_of, moves
+from ast_sim.inference.quantities.relative_errors import QUANTITIES, errors_of, judging_fields, moves
 from ast_sim.inference.trained_run import Run
 from ast_sim.models.simulator import Simulator
-from ast_sim.named_field import REACTION
 from ast_sim.simulate.jobs.fastest_solver import FINER, OWN_STOP_TEST, Outcome, solver_outcomes
 from ast_sim.simulate.jobs.recipe import recipe_of
 from ast_sim.support.argument_checks import file_name, in_short, require_type, several
@@ -247,7 +246,7 @@ def _answer(
     """Add what each effort of each run gives for a scene. All are judged by the fields that the first run
     predicts, and by stored reactions."""
     first, *_ = runs.values()
-    fields = [REACTION, *(name for name, *_ in first.settings.model.data.fields)]
+    fields = judging_fields(first.settings.model)
     for name, of_run in answered.items():
         for effort, timed in of_run.items():
             answer = timed_answer(runs[name].model, scenes.dataset, scenes.split, index, effort, fields)

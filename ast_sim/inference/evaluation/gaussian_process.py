@@ -24,9 +24,8 @@ from ast_sim.dataset.layout import DatasetInfo
 from ast_sim.dataset.reader import Dataset
 from ast_sim.inference.evaluation.deepest_frames import deepest_predicted
 from ast_sim.inference.predicting.question import Question, fields_of
-from ast_sim.inference.quantities.relative_errors import moves, relative_distance
+from ast_sim.inference.quantities.relative_errors import judging_fields, moves, relative_distance
 from ast_sim.models.simulator import Simulator
-from ast_sim.named_field import REACTION
 from ast_sim.scene import Scene, Trajectory
 from ast_sim.simulate.own_assembly.parameters import Values, values_of
 from ast_sim.support.errors import ConfigError, MissingExtra, require
@@ -214,7 +213,7 @@ def _complete(model: Simulator, dataset: Dataset) -> Iterator[DeepestTruth]:
 
 
 def _sample(model: Simulator, dataset: Dataset, split: str, index: int) -> DeepestTruth:
-    fields = [REACTION, *(name for name, *_ in model.config.data.fields)]
+    fields = judging_fields(model.config)
     return DeepestTruth.of(model, dataset.info, dataset.load(split, index, fields))
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ast_sim.named_field import REACTION
 from ast_sim.scene import Trajectory
 from ast_sim.support.argument_checks import require_type
 from ast_sim.support.errors import ConfigError
@@ -17,6 +18,7 @@ from ast_sim.view.fields import require_same_scene
 
 if TYPE_CHECKING:
     from ast_sim.inference.answer import Answer
+    from ast_sim.models.model_config import ModelConfig
 
 QUANTITIES = ("displacement", "reaction", "stress")  # as `errors_of` names them
 SAME = 1e-4  # of the size of a scene: positions that are no farther apart differ by rounding
@@ -78,6 +80,11 @@ def errors_of(answer: Answer, truth: Trajectory) -> dict[str, float]:
     stress = None if answer.stress is None else answer.stress[row]
     _, largest = stress_errors(truth, stress, frame, answer.stress_location or "node")
     return errors if largest is None else {**errors, "stress": largest}
+
+
+def judging_fields(config: ModelConfig) -> list[str]:
+    """The fields of the truth that answers of a model are compared with: the ones it predicts, and reactions."""
+    return [REACTION, *(name for name, *_ in config.data.fields)]
 
 
 def truth_in_place(answer: Answer, truth: Trajectory, rows: list[int]) -> Answer:
