@@ -105,7 +105,7 @@ def build_parser() -> Parser:
         about = run.__doc__ or ""
         sub = subparsers.add_parser(run.__name__, help=about[:1].lower() + about[1:-1], description=about)
         sub.add_argument("--debug", action="store_true", help="show the traceback of an error")
-        sub.set_defaults(run=run)
+        sub.set_defaults(run=run, parser=sub)
         fill(sub)
 
     add(_add_demo, commands.demo)

@@ -186,8 +186,18 @@ def ranges(numbers: Iterable[int]) -> str:
 
 def percent(share: float, digits: int = 2) -> str:
     """A share as text, "1.2 %" or "100 %", never with an exponent."""
-    rounded = f"{100 * float(share):.{digits}g}"
-    return f"{Decimal(rounded):f} %" if math.isfinite(share) else f"{rounded} %"
+    return f"{_without_exponent(100 * share, digits)} %"
+
+
+def measured_time(seconds: float) -> str:
+    """A time that was measured as text, "28.3 ms" or "1.77 s", never with an exponent."""
+    within_a_second = seconds < 0.9995
+    return f"{_without_exponent(1000 * seconds, 3)} ms" if within_a_second else f"{_without_exponent(seconds, 3)} s"
+
+
+def _without_exponent(value: float, digits: int) -> str:
+    rounded = f"{float(value):.{digits}g}"
+    return f"{Decimal(rounded):f}" if math.isfinite(value) else rounded
 
 
 def point(x: Iterable[float]) -> str:

@@ -15,7 +15,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from ast_sim.number_arrays import percent
+from ast_sim.number_arrays import measured_time, percent
 
 TOLERANCES = (0.1, 0.05, 0.025, 0.01, 0.005, 0.002)
 WITHIN = 0.9
@@ -92,7 +92,7 @@ class TradeRow:
     def cells(self) -> list[str]:
         """The error, the setting of each side, the ratio, the verdict and when it pays, as texts of a table."""
         sides = (self.run, self.solver, *self.others.values())
-        settings = ["none" if one is None else f"{1000 * one.middle:.3g} ms: {one.name}" for one in sides]
+        settings = ["none" if one is None else f"{measured_time(one.middle)}: {one.name}" for one in sides]
         ratio = "–" if self.ratio is None else f"{self.ratio:.2f} ({self.low:.2f} to {self.high:.2f})"
         pays = "–" if self.pays_after is None else f"{self.pays_after:,} questions"
         return [f"{100 * self.tolerance:g} %", *settings, ratio, self.verdict, pays]
@@ -264,7 +264,7 @@ def _at(errors: Sequence[float]) -> str:
 
 
 def _told(who: str, setting: Setting | None) -> str:
-    return f"{who}: none" if setting is None else f"{who}: {1000 * setting.middle:.3g} ms ({setting.name})"
+    return f"{who}: none" if setting is None else f"{who}: {measured_time(setting.middle)} ({setting.name})"
 
 
 def _settings(values: Sequence[Mapping[str, Any]]) -> tuple[Setting, ...]:

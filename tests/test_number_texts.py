@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from ast_sim.number_arrays import percent
+from ast_sim.number_arrays import measured_time, percent
 
 
 @pytest.mark.parametrize(
@@ -23,3 +23,19 @@ from ast_sim.number_arrays import percent
 )
 def test_a_share_in_percent_has_no_exponent(share, digits, text):
     assert percent(share, digits) == text
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [
+        (0.02834, "28.3 ms"),
+        (1e-7, "0.0001 ms"),
+        (0.9994, "999 ms"),
+        (0.9996, "1 s"),
+        (1.7749, "1.77 s"),
+        (12345.0, "12300 s"),
+        (math.nan, "nan s"),
+    ],
+)
+def test_a_time_has_no_exponent(seconds, text):
+    assert measured_time(seconds) == text

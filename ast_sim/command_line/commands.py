@@ -258,6 +258,7 @@ def _predict_spec(run: Any, args: argparse.Namespace, wanted: dict[str, Any]) ->
 
 def sweep(args: argparse.Namespace) -> None:
     """Predict an assembly for many values of its parameters: a table and a picture."""
+    from ast_sim.number_arrays import measured_time
     from ast_sim.simulate.own_assembly.grid import parse_settings
 
     picture = args.out.with_suffix(".png")
@@ -274,7 +275,7 @@ def sweep(args: argparse.Namespace) -> None:
         error=error_of(args),
     )
     swept.save(args.out)
-    print(f"{args.out}: {len(swept.rows)} rows, {1000 * swept.seconds / len(swept.rows):.3g} ms each")
+    print(f"{args.out}: {len(swept.rows)} rows, {measured_time(swept.seconds / len(swept.rows))} each")
     if swept.unsettled:
         print(f"not converged: {swept.unsettled} of {len(swept.rows)} rows, where last_newton_step is too large")
     if swept.varied:
@@ -284,11 +285,13 @@ def sweep(args: argparse.Namespace) -> None:
 
 def _save(answer: Any, args: argparse.Namespace, truth: Any) -> None:
     """Write an answer; say how long it took, or why it ended early."""
+    from ast_sim.number_arrays import measured_time
+
     answer.save(args.out, truth)
     if answer.failure is not None:
         raise RolloutError(f"{answer.failure}, in {args.out}")
     steps = len(answer.step_seconds)
-    print(f"{args.out}: {steps} frame{'' if steps == 1 else 's'} predicted in {1000 * answer.seconds:.3g} ms")
+    print(f"{args.out}: {steps} frame{'' if steps == 1 else 's'} predicted in {measured_time(answer.seconds)}")
     print("".join(f"{line}\n" for line in answer.how_far), end="")
     if args.forces is not None:
         answer.save_forces(args.forces)

@@ -14,7 +14,7 @@ from typing import Any
 
 from ast_sim.batches.frame_pairs import target_counts
 from ast_sim.dataset.reader import Dataset
-from ast_sim.number_arrays import percent
+from ast_sim.number_arrays import measured_time, percent
 from ast_sim.planning.forecast import Forecast, forecast
 from ast_sim.planning.trials import GROWTH, LONGEST, MINUTES, Trial, Trials, candidates, round_sizes, trial_folder
 from ast_sim.runs.config_toml import write_settings
@@ -66,7 +66,7 @@ class Plan:
         minutes, scenes = self.more_minutes, self.more_scenes
         return "\n".join([
             f"take: {longest.name}",
-            f"{duration(60 * self.minutes)} are {self.steps:,} steps of {1000 * longest.seconds:.3g} ms; each frame is"
+            f"{duration(60 * self.minutes)} are {self.steps:,} steps of {measured_time(longest.seconds)}; each frame is"
             f" seen {self.passes:.2g} times",
             f"expected error of one call of the network: {error} of the displacement ({low} to {high})",
             f"in the trials, twice the steps leave {percent(minutes)} of the error, twice the scenes"

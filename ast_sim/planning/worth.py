@@ -15,6 +15,7 @@ from ast_sim.dataset.reader import Dataset
 from ast_sim.dataset.solver_seconds import read_seconds
 from ast_sim.inference.effort import Effort
 from ast_sim.inference.trained_run import Run
+from ast_sim.number_arrays import measured_time
 from ast_sim.planning.trials import MINUTES, TIMED, Trials, trial_folder
 from ast_sim.simulate.jobs.generate import checked_workers, generate
 from ast_sim.simulate.own_assembly.spec_reader import read_spec
@@ -64,9 +65,9 @@ class Worth:
         simulation = self.scenes * self.solve_seconds / self.workers
         after = self.pays_after
         return "\n".join([
-            f"a scene takes the solver {self.solve_seconds:.3g} s, an answer of the model"
-            f" {1000 * self.answer_seconds:.3g} ms",
-            f"{duration(60 * self.minutes)} are {self.steps:,} steps of {1000 * self.step_seconds:.3g} ms; with"
+            f"a scene takes the solver {measured_time(self.solve_seconds)}, an answer of the model"
+            f" {measured_time(self.answer_seconds)}",
+            f"{duration(60 * self.minutes)} are {self.steps:,} steps of {measured_time(self.step_seconds)}; with"
             f" {self.scenes:,} scenes each frame is seen {OFTEN} times",
             f"these scenes take {duration(simulation)} on {self.workers} {'core' if self.workers == 1 else 'cores'}",
             "a model does not pay: the solver is as fast" if after is None else

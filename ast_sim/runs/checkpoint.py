@@ -196,9 +196,10 @@ def lock(run_dir: str | os.PathLike[str]) -> Iterator[None]:
         CheckpointError: another process holds the lock (the text gives its number), or the folder cannot be locked.
     """
     path = Path(run_dir) / _LOCK
-    with _explained(Path(run_dir), "cannot be written"):
-        path.touch()
-    with open(path, "r+b", buffering=0) as file:
+    with contextlib.ExitStack() as stack:
+        with _explained(Path(run_dir), "cannot be written"):
+            path.touch()
+            file = stack.enter_context(open(path, "r+b", buffering=0))
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 from ast_sim.support.argument_checks import at_home, is_file_name
-from ast_sim.support.errors import ConfigError, printable
+from ast_sim.support.errors import ConfigError, nearest_name, printable
 
 Key = TypeVar("Key")
 Value = TypeVar("Value")
@@ -39,11 +39,23 @@ class Parser(argparse.ArgumentParser):
         self.register("action", "store", _Once)
 
     def read(self, words: Sequence[str], into: argparse.Namespace) -> None:
-        """Read the arguments. A value -- is refused first: argparse would leave an option without its value."""
+        """Read the arguments. A value -- is refused first: argparse would leave an option without its value. Arguments
+        that nothing takes are refused by the parser of the command, `into.parser`, which knows its options."""
         for word in words:
             if word.startswith("--") and word.endswith("=--"):
                 self.error(f"{word}: -- is no value")
-        self.parse_args(words, into)
+        _, unknown = self.parse_known_args(words, into)
+        if unknown:
+            getattr(into, "parser", self).refuse(unknown)
+
+    def refuse(self, unknown: list[str]) -> NoReturn:
+        """Refuse arguments that nothing takes: the first option by its name, or a word too many."""
+        for word in unknown:
+            if word.startswith("-"):
+                name = word.split("=")[0]
+                known = [option for option in self._option_string_actions if option.startswith("--")]
+                self.error(f"there is no option {name}{nearest_name(name, known)}")
+        self.error(f"{unknown[0]!r} is one argument too many")
 
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"{self.prog}: {printable(message)} (see {self.prog} --help)\n")

@@ -9,6 +9,8 @@ from dataclasses import is_dataclass
 from itertools import islice
 from typing import Any, Generic, TypeVar
 
+from ast_sim.support.environment import processes_on_machine
+
 V = TypeVar("V")
 
 RECENT = 512  # the scenes of a pool of jumps, which come again while they are corrected
@@ -19,9 +21,9 @@ MOST = 1 << 32
 
 def cache_bytes() -> int:
     """The limit of a cache of scenes: an eighth of the machine's memory, at most 4 GiB; processes that train one model
-    together (`LOCAL_WORLD_SIZE`, as `torchrun` sets it) divide it among them."""
+    together divide it among them."""
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    return min(memory // SHARE, MOST) // int(os.environ.get("LOCAL_WORLD_SIZE", 1))
+    return min(memory // SHARE, MOST) // processes_on_machine()
 
 
 class ByteCache(Generic[V]):

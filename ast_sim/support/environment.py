@@ -1,4 +1,5 @@
-"""The environment: the variables AST_SIM_..., which are read here alone, and the environment of processes of ours."""
+"""The environment: the variables AST_SIM_... and what `torchrun` sets, which are read here alone, and the environment of
+processes of ours."""
 
 from __future__ import annotations
 
@@ -15,6 +16,7 @@ VARIABLES = {
     "AST_SIM_DEBUG": ("0", "1"),
     "AST_SIM_KEEP_MEMORY": ("1", "0"),
 }
+BY_TORCHRUN = ("WORLD_SIZE", "RANK", "MASTER_ADDR", "MASTER_PORT")
 SINGLE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 
 
@@ -47,6 +49,31 @@ def _warn_of(names: tuple[str, ...]) -> None:
     """Warn of variables that are none, once in a process."""
     if names:
         warn(f"the environment has {', '.join(names)}; the variables of ast_sim are {', '.join(VARIABLES)}")
+
+
+def place_among_processes() -> tuple[int, int]:
+    """The number of this process among those that train together, and how many they are; 0 and 1 without `torchrun`.
+
+    Raises:
+        ConfigError: WORLD_SIZE tells of several processes, and what `torchrun` sets beside it is missing or wrong.
+    """
+    told = {name: os.environ[name] for name in BY_TORCHRUN if os.environ.get(name)}
+    if told.get("WORLD_SIZE", "1") == "1":
+        return 0, 1
+    numbers = (told.get(name, "") for name in ("RANK", "WORLD_SIZE", "MASTER_PORT"))
+    rank, count, port = (int(text) if text.isascii() and text.isdecimal() else -1 for text in numbers)
+    if not (0 <= rank < count and 0 <= port < 1 << 16 and "MASTER_ADDR" in told):
+        raise ConfigError(
+            f"the environment has {', '.join(f'{name}={text}' for name, text in told.items())}: processes that train"
+            f" together need {', '.join(BY_TORCHRUN)}: start them by torchrun, or unset WORLD_SIZE"
+        )
+    return rank, count
+
+
+def processes_on_machine() -> int:
+    """How many processes train together on this machine, as `torchrun` says; 1 without it."""
+    text = os.environ.get("LOCAL_WORLD_SIZE", "")
+    return max(1, int(text)) if text.isascii() and text.isdecimal() else 1
 
 
 def c_core():  # the checker infers the module with its types

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ast_sim.figures import DeepestFrames, Figures, SceneFigures, main_nodes
+from ast_sim.number_arrays import measured_time
 from ast_sim.view.encode import Json
 
 DEFAULT_UNITS = {"displacement": "m", "stress": "Pa"}
@@ -108,9 +109,9 @@ def _deepest_tiles(frames: DeepestFrames) -> list[Json]:
     """The deepest frame, predicted alone, beside the solver."""
     if frames.relative_error is None or frames.seconds is None:
         return []
-    detail = f"of the displacement, {1000 * frames.seconds:.3g} ms on one thread"
+    detail = f"of the displacement, {measured_time(frames.seconds)} on one thread"
     if frames.solver is not None:
-        detail += f"; the solver: {1000 * frames.solver.seconds:.3g} ms"
+        detail += f"; the solver: {measured_time(frames.solver.seconds)}"
     value = f"{100 * frames.relative_error:.3g}"
     return [{"label": "Deepest frame alone", "value": value, "suffix": "%", "detail": detail}]
 
@@ -122,7 +123,7 @@ def _speed_tiles(evaluation: Figures) -> list[Json]:
     where = f" on {evaluation.threads} thread{'s' if evaluation.threads != 1 else ''}"
     tile = {"label": "Time per step", "value": model, "unit": "s", "detail": f"median over the scenes{where}"}
     if solver:
-        tile["detail"] = f"solver: {1000 * solver:.3g} ms on 1 thread; model{where}; medians"
+        tile["detail"] = f"solver: {measured_time(solver)} on 1 thread; model{where}; medians"
     if evaluation.speedup is None:
         return [tile]
     faster = {

@@ -7,7 +7,7 @@ import os
 from collections.abc import Sequence
 from typing import Any
 
-from ast_sim.number_arrays import percent
+from ast_sim.number_arrays import measured_time, percent
 from ast_sim.support.progress import duration
 from ast_sim.trade_figures import WITHIN, Setting, TradeFigures, front
 from ast_sim.view import page
@@ -61,7 +61,7 @@ def _settings(figures: Sequence[TradeFigures]) -> dict[str, Any]:
             kept = [setting.kept for setting in same]
             if any(map(math.isfinite, kept)):
                 errors = [percent(error, 3) if math.isfinite(error) else "–" for error in kept]
-                time = f"{1000 * same[0].middle:.3g} ms"
+                time = measured_time(same[0].middle)
                 rows.append([side, same[0].name, *errors, time, same[0].command or "–"])
     return {"columns": columns, "rows": rows}
 

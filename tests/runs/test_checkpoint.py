@@ -359,3 +359,9 @@ def test_a_second_writer_is_refused_until_the_first_ends(tmp_path):
         pass
     with checkpoint.lock(tmp_path):
         pass
+
+
+def test_a_lock_that_cannot_be_opened_names_the_folder(tmp_path):
+    (tmp_path / ".lock").mkdir()
+    with pytest.raises(CheckpointError, match=f"{tmp_path}: cannot be written: .*Is a"), checkpoint.lock(tmp_path):
+        pass

@@ -11,7 +11,15 @@ from checks import run_python
 
 from ast_sim.cli import main
 from ast_sim.support import environment
-from ast_sim.support.environment import VARIABLES, check_variables, of_child, variable
+from ast_sim.support.environment import (
+    BY_TORCHRUN,
+    VARIABLES,
+    check_variables,
+    of_child,
+    place_among_processes,
+    processes_on_machine,
+    variable,
+)
 from ast_sim.support.errors import ConfigError
 
 WRONG = [
@@ -56,6 +64,41 @@ def test_names_that_look_like_ours_are_told_once(monkeypatch):
         check_variables()
     with warnings.catch_warnings(action="error"):
         check_variables()
+
+
+def of_torchrun(monkeypatch, text: str) -> str:
+    """The environment "WORLD_SIZE RANK MASTER_ADDR MASTER_PORT", where - is nothing; what an error says of it."""
+    told = []
+    for name, value in zip(BY_TORCHRUN, text.split(), strict=True):
+        monkeypatch.delenv(name, raising=False)
+        if value != "-":
+            monkeypatch.setenv(name, value)
+            told.append(f"{name}={value}")
+    return f"the environment has {', '.join(told)}: processes that train together need"
+
+
+@pytest.mark.parametrize("text", ["- - - -", "- 1 - -", "1 0 - -", "1 - x y", "1 7 - -"])
+def test_a_process_is_alone_without_torchrun(monkeypatch, text):
+    of_torchrun(monkeypatch, text)
+    assert place_among_processes() == (0, 1)
+
+
+def test_a_process_of_torchrun_knows_its_place(monkeypatch):
+    of_torchrun(monkeypatch, "3 2 localhost 29500")
+    assert place_among_processes() == (2, 3)
+
+
+@pytest.mark.parametrize("text", ["2 1 - -", "2 2 h 1", "2 -1 h 1", "2 x h 1", "y 0 h 1", "0 0 h 1", "2 0 h 70000"])
+def test_processes_without_a_place_are_refused(monkeypatch, text):
+    told = of_torchrun(monkeypatch, text)
+    with pytest.raises(ConfigError, match=told):
+        place_among_processes()
+
+
+@pytest.mark.parametrize(("text", "count"), [("", 1), ("0", 1), ("x", 1), ("-2", 1), ("4", 4)])
+def test_the_processes_of_a_machine(monkeypatch, text, count):
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", text)
+    assert processes_on_machine() == count
 
 
 def test_instructions_that_the_processor_does_not_have():

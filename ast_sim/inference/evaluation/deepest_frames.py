@@ -24,7 +24,7 @@ from ast_sim.inference.predicting.question import Question
 from ast_sim.inference.quantities.relative_errors import displacement, relative_error, stress_errors
 from ast_sim.mechanics.linearised_contact import STILL
 from ast_sim.models.simulator import Simulator
-from ast_sim.number_arrays import percent
+from ast_sim.number_arrays import measured_time, percent
 from ast_sim.scene import Trajectory
 from ast_sim.simulate.jobs.fastest_solver import UNMESHED, SolverOutcomes, cheapest, deepest_frame, solver_outcomes
 from ast_sim.support.errors import ConfigError, SimulationError
@@ -148,7 +148,7 @@ def lines(frames: DeepestFrames) -> list[str]:
     after = [f"{100 * error:.3g}" for error in frames.by_calls]
     told = [
         f"the deepest frame at once: error {percent(frames.relative_error, 3)} of the displacement,"
-        f" {1000 * frames.seconds:.3g} ms in the median, on one thread"
+        f" {measured_time(frames.seconds)} in the median, on one thread"
     ]
     if len(after) > 1:
         told.append(f"  after each call, and each Newton step: {', '.join(after)} %")
@@ -167,7 +167,7 @@ def lines(frames: DeepestFrames) -> list[str]:
     ):
         if beside is not None:
             told.append(
-                f"  {what}: {1000 * beside.seconds:.3g} ms, {beside.ratio:.3g} times as long (medians of"
+                f"  {what}: {measured_time(beside.seconds)}, {beside.ratio:.3g} times as long (medians of"
                 f" {beside.scenes} scenes, one thread)"
             )
     return told + _unmeshed(frames.scenes)

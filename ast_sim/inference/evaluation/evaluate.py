@@ -32,7 +32,7 @@ from ast_sim.inference.predicting.question import Question
 from ast_sim.models.data_facts import DataFacts
 from ast_sim.models.simulator import Simulator
 from ast_sim.named_field import STRESS, Output, require_fields
-from ast_sim.number_arrays import percent
+from ast_sim.number_arrays import measured_time, percent
 from ast_sim.scene import Trajectory
 from ast_sim.simulate.jobs.recipe import recipe_of
 from ast_sim.support.errors import ConfigError, DatasetError
@@ -235,7 +235,7 @@ def _all_frames(figures: Figures) -> str:
 
 def _median(seconds: list[float | None]) -> str:
     known = [value for value in seconds if value is not None]
-    return f"{1000 * statistics.median(known):.3g} ms" if len(known) == len(seconds) else "unknown"
+    return measured_time(statistics.median(known)) if len(known) == len(seconds) else "unknown"
 
 
 def _shown(value: float | None) -> str:

@@ -21,6 +21,7 @@ import torch
 from ast_sim.inference.answering import in_domain
 from ast_sim.inference.effort import Effort, choices
 from ast_sim.inference.promises.known_weights import weights_hash
+from ast_sim.number_arrays import measured_time
 from ast_sim.support.argument_checks import in_short
 from ast_sim.support.disk import write_json
 from ast_sim.support.errors import AstSimError, ConfigError
@@ -62,11 +63,12 @@ def effort_within(run: Run, question: Question, ms: float) -> tuple[Effort, str]
     if not within:
         fastest = min(times, key=lambda effort: times[effort])
         raise ConfigError(
-            f"no effort takes at most {ms:g} ms on this machine: the fastest takes {times[fastest]:.3g} ms for such a"
-            f" question, with {fastest.text}"
+            f"no effort takes at most {ms:g} ms on this machine: the fastest takes"
+            f" {measured_time(times[fastest] / 1000)} for such a question, with {fastest.text}"
         )
     best = min(within, key=lambda effort: (known[effort], times[effort]))
-    return best, f"the most accurate within {ms:g} ms: such a question took {times[best]:.3g} ms on this machine"
+    took = measured_time(times[best] / 1000)
+    return best, f"the most accurate within {ms:g} ms: such a question took {took} on this machine"
 
 
 def _times(run: Run, question: Question, efforts: tuple[Effort, ...]) -> dict[Effort, float]:

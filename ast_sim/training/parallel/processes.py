@@ -6,13 +6,14 @@ equals the training of one process with whole batches, up to the rounding of sum
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable
 from datetime import timedelta
 from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, distributed
+
+from ast_sim.support.environment import place_among_processes
 
 PATIENCE = timedelta(hours=12)  # how long a process waits for another one that writes a checkpoint or validates
 
@@ -25,10 +26,13 @@ class Processes:
     Attributes:
         rank: number of this process, from 0.
         count: number of processes; 1 without `torchrun`.
+
+    Raises:
+        ConfigError: the environment tells of several processes, but not all that `torchrun` would.
     """
 
     def __init__(self) -> None:
-        self.rank, self.count = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
+        self.rank, self.count = place_among_processes()
 
     def __enter__(self) -> Processes:
         if self.count > 1:
