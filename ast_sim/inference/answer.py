@@ -23,7 +23,7 @@ from ast_sim.inference.quantities.forces_and_figures import (
 )
 from ast_sim.inference.quantities.relative_errors import errors_of, require_quantity, require_same_motion
 from ast_sim.mechanics.driven import Driven
-from ast_sim.mechanics.linearised_contact import STILL
+from ast_sim.mechanics.linearised.linearised_contact import STILL
 from ast_sim.mechanics.physics_check import Law, PhysicsCheck, check_physics
 from ast_sim.named_field import NamedField
 from ast_sim.number_arrays import percent
@@ -249,8 +249,8 @@ class Answer:
         """[S, 3] the force in newton on the prescribed nodes `driven`.
 
         If the model predicts nodal reactions (`fields["reaction"]`), it is their sum. Without them, and after Newton
-        steps, which make the positions right, it follows from the strains of the positions, if the law of the material
-        is known and elastic. The bundled solver has this law; if the data follow another one, so would their force.
+        steps, it follows from the strains of the positions, if the law of the material is known and elastic: the law of
+        the bundled solver. Where Newton steps have ended, what touches held nodes beside free ones counts, too.
 
         Raises:
             ConfigError: there is none; the text says why: no prescribed node moves; or the scene has inertia or no

@@ -12,7 +12,7 @@ from ast_sim.inference.answer import Answer
 from ast_sim.inference.assembly_questions import ask
 from ast_sim.inference.effort import Effort
 from ast_sim.inference.promises.chosen_effort import ErrorLimit
-from ast_sim.mechanics.linearised_contact import STILL
+from ast_sim.mechanics.linearised.linearised_contact import STILL
 from ast_sim.models.model_config import ModelConfig
 from ast_sim.runs.scope import Scope
 from ast_sim.simulate.own_assembly.parameters import flattened

@@ -9,6 +9,7 @@ import numpy as np
 
 from ast_sim.mechanics.contact_and_friction import ContactSettings
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean
+from ast_sim.mechanics.linearised.contact_forces import ContactForces
 from ast_sim.motion_between_frames import Course, Leg
 from ast_sim.scene import AttributeValue, Scene
 from ast_sim.support.errors import SimulationError
@@ -48,6 +49,10 @@ class SolidCase:
         stored = (0, *frames)
         course = self.course or Course(self.prescribed_position, self.scene.prescribed)
         return replace(self, prescribed_position=self.prescribed_position[list(stored)], course=course.storing(stored))
+
+    def contact_forces(self) -> ContactForces:
+        """The forces of its contact. They know one coefficient of friction; of several they get the largest."""
+        return ContactForces(self.scene, self.contact.dhat, max(self.contact.frictions(self.scene)))
 
     def notes(self) -> list[str]:
         """What a user should know of the scene, a sentence each."""

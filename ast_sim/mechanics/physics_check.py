@@ -1,10 +1,6 @@
 """Is an answer physics? What can be said of positions alone, without a truth.
 
-At equilibrium the elastic forces f on the free nodes are the forces of contact, C^T l with l >= 0, where a row of C is
-the direction of the force of a near pair (`linearised_contact`). On positions that are nearly right the l >= 0 are
-taken that leave least, min |f - C^T l|; what is left is the residual. With friction a pair of a node and a face has
-four directions, the corners of a pyramid inside Coulomb's cone. Where nothing overlaps, pairs of edges push, too
-(ipctk).
+What the forces of contact do not explain of the elastic forces on the free nodes (`contact_forces`) is the residual.
 """
 
 from __future__ import annotations
@@ -12,18 +8,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Any
 
 import numpy as np
-import scipy.sparse
-from scipy.optimize import nnls
 
 from ast_sim.element_topology import signed_volumes
 from ast_sim.material import FRICTION, Material
-from ast_sim.mechanics.contact_and_friction import Contact, ContactSettings, load_ipctk
+from ast_sim.mechanics.contact_and_friction import ContactSettings
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean
 from ast_sim.mechanics.elements.second_order import elastic_body
-from ast_sim.mechanics.linearised_contact import CLEARANCE, NewtonSteps
+from ast_sim.mechanics.linearised.contact_forces import ContactForces
+from ast_sim.mechanics.linearised.linearised_contact import CLEARANCE, NewtonSteps
 from ast_sim.mechanics.solver import SolverSettings
 from ast_sim.plausibility.overlaps import nodes_inside
 from ast_sim.scene import Scene
@@ -66,6 +60,10 @@ class Law:
         """
         young = np.broadcast_to(self.of_elements(scene).young, scene.num_elements)[scene.deforming_elements]
         return ContactSettings(self.contact_range, float(young.mean()), self.friction(scene))
+
+    def contact_forces(self, scene: Scene) -> ContactForces | None:
+        """The forces of contact of a scene; None: its range is not known."""
+        return ContactForces(scene, self.contact_range, self.friction(scene)) if self.contact_range else None
 
     def newton_steps(self, scene: Scene) -> NewtonSteps:
         """The Newton steps of a scene under this law.
@@ -213,20 +211,11 @@ class _Balance:
     """The balance of forces of a scene; made once, because what depends on its rest does not change."""
 
     def __init__(self, scene: Scene, law: Law) -> None:
-        self._range = law.contact_range
-        self._friction = law.friction(scene)
-        self._pairs = law.newton_steps(scene)
-        rest = scene.rest_position.astype(np.float64)
         deforming = np.flatnonzero(~scene.rigid_elements)
         elements = scene.elements[deforming].astype(np.int64)
+        rest = scene.rest_position.astype(np.float64)
         self._elasticity = elastic_body(rest, elements, law.of_elements(scene).of(deforming))
-        settings = ContactSettings(law.contact_range, 1.0)
-        surface = scene.surface()
-        self._contact = Contact(rest, surface, scene.body, settings, ~scene.deforming_nodes)
-        local = np.unique(surface, return_inverse=True)[1].reshape(-1, 3).astype(np.int32)
-        self._edges_and_faces = load_ipctk().edges(local), local
-        held = scene.prescribed | ~np.isin(np.arange(scene.num_nodes), elements)
-        self._free = np.flatnonzero(np.repeat(~held, 3))
+        self._contact = ContactForces(scene, law.contact_range, law.friction(scene))
         self._held = scene.prescribed
 
     def of(self, position: np.ndarray) -> tuple[float, float]:
@@ -235,60 +224,12 @@ class _Balance:
         if deformation.J.min() <= 0:
             return float("inf"), float("inf")
         forces, element_force = self._elasticity.gradient(deformation)
-        left, pressed = self._left(forces.ravel()[self._free], self._cone(position))
+        directions = self._contact.directions(position)
+        pressed = self._contact.sizes(directions, forces)
+        left = np.zeros(forces.size)
+        left[self._contact.free] = (forces.ravel() - directions.T @ pressed)[self._contact.free]
         unit = self._elasticity.unit_force
         allowed = max(SolverSettings().force_tolerance * element_force, 1e-8 * unit)
-        total = np.zeros(forces.size)
-        total[self._free] = left
-        magnitude = float(np.linalg.norm(forces[self._held], axis=1).sum()) + pressed
-        unbalanced = float(np.linalg.norm(total.reshape(-1, 3).sum(axis=0)))
+        magnitude = float(np.linalg.norm(forces[self._held], axis=1).sum() + pressed.sum())
+        unbalanced = float(np.linalg.norm(left.reshape(-1, 3).sum(axis=0)))
         return float(np.abs(left).max(initial=0)) / allowed, unbalanced / max(magnitude, SLIGHT_STRAIN * unit)
-
-    def _cone(self, position: np.ndarray) -> scipy.sparse.csr_array:
-        """[P, F] the directions in which contact may push the free dofs; see the head of this file."""
-        pairs = self._pairs.near_pairs(position)
-        touching = np.flatnonzero(pairs.gap <= self._range)
-        normal = pairs.directions[touching]
-        count = len(pairs.gap)
-        parts = [normal]
-        if self._friction:
-            tangents = [self._friction * pairs.directions[touching + axis * count] for axis in (1, 2)]
-            parts = [normal + sign * tangent for tangent in tangents for sign in (1, -1)]
-        if not (pairs.gap < 0).any():  # a distance knows no sides: it says nothing of bodies that overlap
-            parts.append(self._near_directions(position)[:, self._free])
-        return scipy.sparse.csr_array(scipy.sparse.vstack(parts))
-
-    def _near_directions(self, position: np.ndarray) -> scipy.sparse.csr_array:
-        """[P, 3 N]: of each pair of nodes, edges or faces within the range of contact the derivative of its distance by
-        the positions, with a length of 1."""
-        contact = self._contact
-        contact.restart()
-        contact.collision_free_fraction(position, position)
-        state = contact.at(position)
-        rows = [np.zeros(0, int)]
-        columns = [np.zeros(0, int)]
-        values = [np.zeros(0)]
-        for row in range(len(state.collisions)):
-            # No name keeps the pair: ipctk's pairs must not outlive their collection.
-            nodes, gradient = self._of_pair(state.collisions[row], state.vertices)
-            columns.append((3 * nodes[:, None] + np.arange(3)).ravel())
-            rows.append(np.full(gradient.size, row))
-            values.append(gradient / np.linalg.norm(gradient))
-        entries = np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
-        return scipy.sparse.csr_array(entries, shape=(len(state.collisions), 3 * contact.num_nodes))
-
-    def _of_pair(self, pair: Any, vertices: Any) -> tuple[np.ndarray, np.ndarray]:
-        """The nodes [n] of a pair of ipctk, and the derivative [3 n] of its squared distance by their positions."""
-        nodes = self._contact.nodes[[vertex for vertex in pair.vertex_ids(*self._edges_and_faces) if vertex >= 0]]
-        return nodes, np.array(pair.compute_distance_gradient(pair.dof(vertices, *self._edges_and_faces)))
-
-    def _left(self, forces: np.ndarray, cone: scipy.sparse.csr_array) -> tuple[np.ndarray, float]:
-        """The forces [F] that contact does not explain, and the sum of the contact forces; see the head of the file."""
-        touched = np.unique(cone.nonzero()[1])
-        if not len(touched):
-            return forces, 0.0
-        try:
-            pressed = nnls(cone[:, touched].toarray().T, forces[touched], maxiter=30 * (len(cone.indptr) - 1))[0]
-        except RuntimeError as error:
-            raise SimulationError(f"the forces of contact were not found: {error}") from error
-        return forces - cone.T @ pressed, float(pressed.sum())

@@ -14,7 +14,7 @@ from ast_sim.mechanics.contact_and_friction import Contact
 from ast_sim.mechanics.elements.neo_hookean import von_mises
 from ast_sim.mechanics.elements.second_order import elastic_body
 from ast_sim.mechanics.frames import MAX_FRAME_ITERATIONS, FrameRecord, Frames, GivenUp
-from ast_sim.mechanics.linearised_contact import NewtonSteps
+from ast_sim.mechanics.linearised.linearised_contact import NewtonSteps
 from ast_sim.mechanics.load_halving import QuasiStatic
 from ast_sim.mechanics.solver import SolverSettings
 from ast_sim.mechanics.unfinished import Checkpoint

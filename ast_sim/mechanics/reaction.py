@@ -6,11 +6,15 @@ the moved nodes is the sum of w_i f_i for every field w that is 1 where these ac
 other nodes that are held or touched. Where a body touches itself, its two sides push each other: w is the same on both.
 On predicted positions, f_i is not zero elsewhere. A smooth w then averages the stress over all of the body, where the
 forces at the moved nodes alone would show the errors of one layer of elements.
+
+What contact brings straight into held nodes strains nothing. Where a face is touched that has held and free corners, it
+follows from the free ones (`contact_forces`). Where all that touch each other are held, positions do not show it.
 """
 
 from __future__ import annotations
 
 import numpy as np
+import scipy.sparse
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import cg
@@ -19,10 +23,14 @@ from ast_sim.element_topology import linear_elements
 from ast_sim.mechanics.driven import Driven
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean
 from ast_sim.mechanics.elements.second_order import elastic_body
+from ast_sim.mechanics.linearised.contact_forces import ContactForces
 from ast_sim.scene import Scene
 
 REACH = 1.0  # a node counts as touched if another body is nearer than this, in mean edge lengths
 OPPOSITE = 0.5  # cosine between opposite normals, at most; at an edge, a normal is the mean of its faces
+EXPLAINED = (
+    0.2  # contact must explain the elastic forces on free nodes up to this share; else nothing is in equilibrium
+)
 SMOOTH = 1e-3  # residual to which the smooth field is computed; every field is exact at equilibrium
 
 
@@ -34,13 +42,15 @@ class Reaction:
     Args:
         driven: the moved nodes.
         law: of all elements; rigid ones ignore it.
+        contact: between the bodies. None: it is not known, and what goes straight into held nodes is left out.
     """
 
-    def __init__(self, scene: Scene, driven: Driven, law: NeoHookean) -> None:
+    def __init__(self, scene: Scene, driven: Driven, law: NeoHookean, contact: ContactForces | None = None) -> None:
         import igl  # takes 0.2 s
 
         self.scene = scene
         self.driven = driven
+        self._contact = contact
         self._rest = scene.rest_position.astype(np.float64)
         soft = np.flatnonzero(~scene.rigid_elements)
         self._elasticity = elastic_body(self._rest, scene.elements[soft], law.of(soft))
@@ -69,13 +79,33 @@ class Reaction:
         return 0.0 if axis is None else axis.torque(position, self.shares(position))
 
     def shares(self, position: np.ndarray) -> np.ndarray:
-        """[N,3] w_i f_i, the share of each node in that force."""
+        """[N,3] w_i f_i, the share of each node in that force, and what contact brings straight into held nodes."""
         position = position.astype(np.float64)
         source, sink = self._ends(position)
         if not source.any():
             return np.zeros_like(position)
         forces, _ = self._elasticity.gradient(self._elasticity.evaluate(position))
-        return self._field(source, sink, self._folds(position))[:, None] * forces
+        shares = self._field(source, sink, self._folds(position))[:, None] * forces
+        return shares if self._contact is None else shares + self._straight(self._contact, position, forces)
+
+    def _straight(self, contact: ContactForces, position: np.ndarray, forces: np.ndarray) -> np.ndarray:
+        """[N,3] the forces of contact between the driven body and held nodes, where elastic `forces` [N,3] show them; 0
+        elsewhere, and on positions that are no equilibrium."""
+        of_body = self.scene.body == self.driven.body
+        pushes_others = self.driven.body in self.scene.rigid_bodies
+        held = self.scene.prescribed & self._deforming & ~of_body if pushes_others else self.driven.nodes
+        directions = contact.directions(position)
+        straight = _of(directions, held) & _of(directions, of_body)
+        none = np.zeros_like(position)
+        if not straight.any():
+            return none
+        sizes = contact.sizes(directions, forces)
+        elastic = forces.ravel()[contact.free]
+        left = elastic - (directions.T @ sizes)[contact.free]
+        if np.linalg.norm(left) > EXPLAINED * np.linalg.norm(elastic):
+            return none
+        pushed = (directions[straight].T @ sizes[straight]).reshape(-1, 3)
+        return np.where(held[:, None], pushed if pushes_others else -pushed, none)
 
     def _ends(self, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """[N] bool twice: the deforming nodes on which the moved nodes act, and all others that are held or touched."""
@@ -154,3 +184,8 @@ class Reaction:
             rows = spread.T @ self._laplacian[inner]
             field[inner] = spread @ cg(rows[:, inner] @ spread, -rows @ field, rtol=SMOOTH, maxiter=500)[0]
         return field
+
+
+def _of(directions: scipy.sparse.csr_array, nodes: np.ndarray) -> np.ndarray:
+    """[P] bool: which of the directions [P, 3 N] move one of the nodes, [N] bool."""
+    return abs(directions) @ np.repeat(nodes, 3).astype(float) > 0

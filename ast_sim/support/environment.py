@@ -1,4 +1,4 @@
-"""The environment: the variables AST_SIM_... and what `torchrun` sets, which are read here alone, and the environment of
+"""The environment: the variables AST_SIM_... and what `torchrun` sets, which are read here alone; the environment of
 processes of ours."""
 
 from __future__ import annotations

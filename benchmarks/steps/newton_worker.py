@@ -13,7 +13,7 @@ import numpy as np
 
 import ast_sim
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean
-from ast_sim.mechanics.linearised_contact import NewtonSteps
+from ast_sim.mechanics.linearised.linearised_contact import NewtonSteps
 
 STEPS = 3
 DEPTH = 0.02  # of the press, in metres

@@ -17,7 +17,7 @@ import numpy as np
 import ast_sim
 from ast_sim.inference.effort import MOST_NEWTON_STEPS, Effort, can_make_newton_steps
 from ast_sim.inference.evaluation.deepest_frames import deepest_frames
-from ast_sim.mechanics.linearised_contact import STILL
+from ast_sim.mechanics.linearised.linearised_contact import STILL
 from ast_sim.support.provenance import provenance
 from benchmarks.studies.phrases import beside_solver, over_the_scenes, settings_tried
 from benchmarks.studies.rows import study_rows

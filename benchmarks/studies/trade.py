@@ -102,12 +102,12 @@ Made by `python -m benchmarks.studies.trade` from `benchmarks/results/trade.json
 
 On each side the fastest setting counts that keeps the error in 90 % of the scenes, by its median time: of the run the
 efforts that it can make, of the solver its variants (stop tests, ranges of contact, coarser meshes, linearised steps,
-nested iteration). Neither side may choose scene by scene. Errors are relative, at the frame in which a scene is
-deformed most: of the displacement, of the force on the moved body, of the largest stress. A solution on a coarser mesh
-gives the force and the stress of that mesh. Times are processor time on one thread, beside other work on the same
-machine, with all that is prepared for a mesh; meshing is not counted. A ratio is the median over the scenes of the
-solver's time over the run's, with an interval of 95 % by bootstrap over the scenes. Who is faster follows from the
-interval. "Pays after" counts simulation and training against the time that an answer saves.
+nested iteration, with friction frame by frame). Neither side may choose scene by scene. Errors are relative, at the
+frame in which a scene is deformed most: of the displacement, of the force on the moved body, of the largest stress. A
+solution on a coarser mesh gives the force and the stress of that mesh. Times are processor time on one thread, beside
+other work on the same machine, with all that is prepared for a mesh; meshing is not counted. A ratio is the median
+over the scenes of the solver's time over the run's, with an interval of 95 % by bootstrap over the scenes. Who is
+faster follows from the interval. "Pays after" counts simulation and training against the time that an answer saves.
 
 For a run of your own: `ast-sim trade RUN DATA --out trade.html`.
 """

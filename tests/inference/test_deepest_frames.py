@@ -17,7 +17,7 @@ from ast_sim.inference.evaluation.deepest_frames import deepest_frames, errors_b
 from ast_sim.inference.predicting import jump, jumping_scene
 from ast_sim.inference.predicting.jump import answer_steps
 from ast_sim.inference.predicting.question import Question, law_of
-from ast_sim.mechanics.linearised_contact import STILL, NewtonSteps
+from ast_sim.mechanics.linearised.linearised_contact import STILL, NewtonSteps
 from ast_sim.models.data_facts import DataFacts
 from ast_sim.models.registry import find_preset
 from ast_sim.models.simulator import Prediction, Simulator

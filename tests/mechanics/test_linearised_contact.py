@@ -8,11 +8,11 @@ from meshes import box
 from scipy.optimize import nnls
 from solids import blocks, pressed, scene_of
 
-from ast_sim.mechanics import linearised_contact
 from ast_sim.mechanics.elements.elasticity import Elasticity
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean
 from ast_sim.mechanics.linear_algebra import compliance
-from ast_sim.mechanics.linearised_contact import STILL, NewtonSteps
+from ast_sim.mechanics.linearised import linearised_contact
+from ast_sim.mechanics.linearised.linearised_contact import STILL, NewtonSteps
 from ast_sim.mechanics.quasi_static import quasi_static, solve_frame
 from ast_sim.scene import NodeType
 from ast_sim.simulate.shapes import mesh
@@ -60,7 +60,7 @@ def test_steps_lead_to_the_solution_of_the_solver(squeezed, way):
         for _ in range(3):
             position = solver.step(position)
             left.setdefault(clearance, []).append(rms((position - truth)[free]) / size)
-        assert solver.near_pairs(position).gap.min() == pytest.approx(clearance * DHAT, abs=1e-5)
+        assert solver.surfaces.pairs(position).gap.min() == pytest.approx(clearance * DHAT, abs=1e-5)
     assert np.array_equal(position[~free], truth[~free])
     assert left[0.92][0] < 0.017 and left[0.92][-1] < 0.016 and left[0.0][-1] > 0.05
 
@@ -124,7 +124,7 @@ def test_a_step_turns_no_element_over_and_has_the_size_of_the_whole_one(squeezed
     double[free] += 2 * made * way
     assert made <= 0.5 and deforming.evaluate(moved).J.min() > 0 >= deforming.evaluate(double).J.min()
     share = rms(way) / rms((moved - case.scene.rest_position)[free])
-    assert solver.size(truth, moved) == pytest.approx(max(abs(way).max() / solver._length, share))
+    assert solver.size(truth, moved) == pytest.approx(max(abs(way).max() / solver.surfaces.length, share))
 
 
 def test_steps_end_where_nothing_is_displaced(squeezed):
@@ -141,9 +141,9 @@ def test_steps_end_where_nothing_is_displaced(squeezed):
 def test_a_body_deep_inside_another_is_no_pair(squeezed):
     case, truth, *_ = squeezed
     solver = NewtonSteps(case.scene, case.material, 0.0)
-    touching = len(solver.near_pairs(truth).gap)
+    touching = len(solver.surfaces.pairs(truth).gap)
     apart = truth + np.where(case.scene.body == 1, 1.0, 0)[:, None]
-    assert touching > 10 and len(solver.near_pairs(apart).gap) == 0
+    assert touching > 10 and len(solver.surfaces.pairs(apart).gap) == 0
 
 
 def test_a_body_that_nothing_holds_is_refused():
@@ -259,10 +259,10 @@ def test_what_is_not_looked_at_is_not_near(squeezed, monkeypatch):
     """Only what comes near the box around the other body is compared; the pairs are the same as of whole surfaces."""
     case, truth, *_ = squeezed
     solver = NewtonSteps(case.scene, case.material, 0.0)
-    pairs = solver.near_pairs(truth)
+    pairs = solver.surfaces.pairs(truth)
     points, others = truth.T, truth[case.scene.body == 1].T
     kept = nearest_surface.beside(points, points, others, others, 0.0)
     assert 0 < kept.sum() < len(truth)
     monkeypatch.setattr(nearest_surface, "beside", lambda low, *_: np.ones(low.shape[1], bool))
-    whole = solver.near_pairs(truth)
+    whole = solver.surfaces.pairs(truth)
     assert np.array_equal(pairs.gap, whole.gap) and abs(pairs.directions - whole.directions).max() < 1e-12

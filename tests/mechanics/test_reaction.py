@@ -11,6 +11,7 @@ from ast_sim.material import Material
 from ast_sim.mechanics.driven import Driven
 from ast_sim.mechanics.elements.elasticity import Elasticity
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean
+from ast_sim.mechanics.linearised.contact_forces import ContactForces
 from ast_sim.mechanics.reaction import Reaction
 from ast_sim.scene import NodeType, Scene
 from ast_sim.simulate.families import assembly
@@ -120,6 +121,25 @@ def test_a_part_that_is_held_at_one_end_and_moved_at_the_other(tmp_path, order, 
         way = (truth.position[-1] - rest)[driven.nodes][0]
         assert found.of(truth.position[-1]) @ way / 2 == pytest.approx(energy[-1], rel=0.15)
         assert "torque" not in recorded
+
+
+@pytest.mark.parametrize(("friction", "tolerance"), [(0.0, 1e-3), (0.3, 0.01)])
+def test_what_goes_straight_into_held_nodes_counts(tmp_path, friction, tolerance):
+    """The punch stands on faces of which one corner is held: three fifths of its force strain no element."""
+    spec = SPEC.replace('fixed = "zmin"', 'fixed = "xmin"').replace("frames = 3", f"frames = 3\nfriction = {friction}")
+    scene, truth = solved(tmp_path, spec.replace("rigid = true", "rigid = true\noffset = [-2, 0, 0]"), travel=0.5)
+    contact, nodal = ContactForces(scene, 0.05, friction), truth.fields["reaction"].values
+    punch, block = (scene.prescribed & (scene.body == body) for body in (1, 0))
+    for body, nodes in ((1, punch), (0, block)):
+        driven = Driven(body, nodes, truth.position[:, nodes].astype(float))
+        force, strains = Reaction(scene, driven, law_of(scene), contact), Reaction(scene, driven, law_of(scene))
+        for position, stored in zip(truth.position[1:], nodal[1:, nodes].sum(axis=1), strict=True):
+            away = np.linalg.norm(force.of(position) - stored)
+            assert away < tolerance * np.linalg.norm(stored)
+            assert np.linalg.norm(strains.of(position) - stored) > 0.5 * np.linalg.norm(stored)
+    shaken = truth.position[-1] + np.random.default_rng(0).normal(0, 0.05, truth.position[-1].shape)
+    shaken[scene.prescribed] = truth.position[-1][scene.prescribed]
+    np.testing.assert_array_equal(force.shares(shaken), strains.shares(shaken))  # forces of no equilibrium show nothing
 
 
 def test_it_is_the_force_on_the_body_that_moves_farthest_in_all_frames(tmp_path):

@@ -22,7 +22,7 @@ from ast_sim.inference.effort import Effort, EffortErrors
 from ast_sim.inference.predicting.jump import answer_steps
 from ast_sim.inference.predicting.question import Question
 from ast_sim.inference.quantities.relative_errors import displacement, relative_error, stress_errors
-from ast_sim.mechanics.linearised_contact import STILL
+from ast_sim.mechanics.linearised.linearised_contact import STILL
 from ast_sim.models.simulator import Simulator
 from ast_sim.number_arrays import measured_time, percent
 from ast_sim.scene import Trajectory

@@ -19,7 +19,7 @@ from ast_sim.inference.answer import Answer
 from ast_sim.inference.predicting.predicted_frames import Start
 from ast_sim.inference.predicting.question import Question, law_of
 from ast_sim.mechanics.equilibria import Equilibria
-from ast_sim.mechanics.linearised_contact import STILL, NewtonSteps
+from ast_sim.mechanics.linearised.linearised_contact import STILL, NewtonSteps
 from ast_sim.models.simulator import Simulator
 from ast_sim.named_field import STRESS
 from ast_sim.scene import Scene

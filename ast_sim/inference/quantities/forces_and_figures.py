@@ -140,8 +140,8 @@ def _newton(answer: Answer, driven: Driven) -> np.ndarray:
         raise ConfigError(f"{answer.name} has no reaction: {error}") from error
     from ast_sim.mechanics.reaction import Reaction
 
-    assert answer.info is not None
-    reaction = Reaction(answer.scene, driven, law)
+    assert answer.info is not None and answer.law is not None
+    reaction = Reaction(answer.scene, driven, law, answer.law.contact_forces(answer.scene))
     shares = [reaction.shares(position) for position in answer.position]
     return LENGTH_UNITS[answer.info.length_unit] ** 2 * np.array(shares).reshape(-1, answer.scene.num_nodes, 3)
 

@@ -26,7 +26,7 @@ from ast_sim.mechanics.case import Drawn, SolidCase
 from ast_sim.mechanics.driven import Driven
 from ast_sim.mechanics.elements.second_order import elastic_body
 from ast_sim.mechanics.equilibria import Equilibria
-from ast_sim.mechanics.linearised_contact import CLEARANCE, NewtonSteps
+from ast_sim.mechanics.linearised.linearised_contact import CLEARANCE, NewtonSteps
 from ast_sim.mechanics.quasi_static import OneFrame, solve_frame
 from ast_sim.mechanics.reaction import Reaction
 from ast_sim.mechanics.solver import SolverSettings
@@ -64,12 +64,12 @@ def outcomes_of(task: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     with Dataset(task["dataset"]) as dataset:
         scene = dataset.scene(task["split"], task["index"])
         truth = dataset.frames(task["split"], task["index"], task["frame"], task["frame"] + 1)[0][0].astype(np.float64)
-    frame = task["frame"] if recipe.keep is None else recipe.keep[task["frame"] - 1]
+    walk = tuple(range(1, task["frame"] + 1)) if recipe.keep is None else recipe.keep[: task["frame"]]
     started = _seconds()
     drawn = draw_sample(recipe, task["split"], task["index"])
     draw_seconds = _seconds() - started
     _require_same(drawn.case.scene, scene)
-    solver = VariantSolver(drawn, frame, truth, family_module(recipe.family).SETTINGS, task)
+    solver = VariantSolver(drawn, walk, truth, family_module(recipe.family).SETTINGS, task)
     outcomes = [solver.outcome(SolverVariant(**variant)) for variant in task["variants"]]
     facts = {
         "displacement": solver.displacement,
@@ -103,16 +103,23 @@ class VariantSolver:
 
     Args:
         drawn: the scene.
-        frame: number of the frame in the motion of the scene.
+        walk: the numbers of the dataset's frames in the motion of the scene, up to the one to be solved.
         truth: [N,3] float64, the dataset's positions in this frame.
         settings: the tolerances with which the dataset was made.
         effort: `starts`, `repeats` and `most_iterations`.
     """
 
     def __init__(
-        self, drawn: Drawn, frame: int, truth: np.ndarray, settings: SolverSettings, effort: dict[str, Any]
+        self,
+        drawn: Drawn,
+        walk: tuple[int, ...],
+        truth: np.ndarray,
+        settings: SolverSettings,
+        effort: dict[str, Any],
     ) -> None:
-        self.drawn, self.frame, self.truth, self.settings, self.effort = drawn, frame, truth, settings, effort
+        self.drawn, self.walk, self.truth, self.settings, self.effort = drawn, walk, truth, settings, effort
+        self.frame = walk[-1]
+        self.path_counts = max(drawn.case.contact.frictions(drawn.case.scene)) > 0
         self.free = ~drawn.case.scene.prescribed
         self.rest = drawn.case.scene.rest_position.astype(np.float64)
         self.displacement = _root_mean_square((truth - self.rest)[self.free])
@@ -120,7 +127,7 @@ class VariantSolver:
         self._meshes: dict[float, tuple[SolidCase | str, float]] = {1.0: (drawn.case, 0.0)}
         self._solved: dict[SolverVariant, tuple[int, OneFrame]] = {}
         # The libraries are loaded in the first solution; nobody's time should hold that.
-        solve_frame(drawn.case, frame, settings, most_iterations=1)
+        solve_frame(drawn.case, self.frame, settings, most_iterations=1)
         self._linearised(drawn.case, 1)
         self._on_own_mesh(drawn.case, self.rest)
 
@@ -189,12 +196,16 @@ class VariantSolver:
 
     def _solution(self, case: SolidCase, variant: SolverVariant) -> tuple[int, OneFrame]:
         """The start and the solution on the mesh of a variant; variants that differ in what follows share it."""
-        alone = replace(variant, name="", newton=0, finished=False)
+        alone = replace(
+            variant, name="", newton=0, finished=False, every_frame=variant.every_frame and self.path_counts
+        )
         if alone not in self._solved:
             case = replace(case, contact=replace(case.contact, dhat=variant.dhat * case.contact.dhat))
             settings = replace(self.settings, force_tolerance=variant.tolerance * self.settings.force_tolerance)
             if variant.linearised:
                 solved = variant.linearised, self._best(lambda: self._linearised(case, variant.linearised))
+            elif alone.every_frame:
+                solved = 0, self._best(lambda: self._every_frame(case, settings))
             else:
                 solved = self._fastest(case, settings)
             self._solved[alone] = solved
@@ -219,6 +230,11 @@ class VariantSolver:
                     best = start, solved
         assert best is not None
         return best
+
+    def _every_frame(self, case: SolidCase, settings: SolverSettings) -> OneFrame:
+        """From each frame of the dataset to the next."""
+        most = self.effort["most_iterations"]
+        return solve_frame(case.keeping(self.walk), len(self.walk), settings, first=0, most_iterations=most)
 
     def _linearised(self, case: SolidCase, steps: int) -> OneFrame:
         """`steps` load steps of one Newton step with linearised contact, and one Newton step more."""
@@ -288,7 +304,9 @@ class _Loads:
 
     def __init__(self, case: SolidCase) -> None:
         scene = case.scene
-        self._reaction = Reaction(scene, Driven.of(scene, case.prescribed_position), case.material)
+        self._reaction = Reaction(
+            scene, Driven.of(scene, case.prescribed_position), case.material, case.contact_forces()
+        )
         soft = np.flatnonzero(~scene.rigid_elements)
         rest = scene.rest_position.astype(np.float64)
         self._elasticity = elastic_body(rest, scene.elements[soft].astype(np.int64), case.material.of(soft))

@@ -20,7 +20,7 @@ from ast_sim.dataset.layout import LENGTH_UNITS
 from ast_sim.mechanics.case import SolidCase
 from ast_sim.mechanics.driven import Driven
 from ast_sim.mechanics.frames import GivenUp
-from ast_sim.mechanics.linearised_contact import CLEARANCE, STILL, NewtonSteps
+from ast_sim.mechanics.linearised.linearised_contact import CLEARANCE, STILL, NewtonSteps
 from ast_sim.mechanics.quasi_static import SolidFrames, solve_frame
 from ast_sim.mechanics.reaction import Reaction
 from ast_sim.scene import Trajectory
@@ -161,7 +161,8 @@ def _from_coarse(coarse: SolidCase, solved: Trajectory, fine: SolidCase, frame: 
 
 def _force(case: SolidCase, position: np.ndarray, quantity: str) -> float:
     """In pascal times the square of the unit of length (torque: the cube), at equilibrium."""
-    reaction = Reaction(case.scene, Driven.of(case.scene, case.prescribed_position), case.material)
+    driven = Driven.of(case.scene, case.prescribed_position)
+    reaction = Reaction(case.scene, driven, case.material, case.contact_forces())
     return abs(reaction.torque(position)) if quantity == "torque" else float(np.linalg.norm(reaction.of(position)))
 
 

@@ -172,7 +172,7 @@ def test_what_fails_is_said_and_not_raised(plates):
     shares, drawn = [], draw_sample(Recipe("deforming_plate", 5, 150, 9), "train", 0)
     effort = {"starts": [1], "repeats": 1, "most_iterations": 9}
     solver = VariantSolver(
-        replace(drawn, remesh=refuse), 5, drawn.case.prescribed_position[5], SolverSettings(), effort
+        replace(drawn, remesh=refuse), (2, 5), drawn.case.prescribed_position[5], SolverSettings(), effort
     )
     outcomes = [solver.outcome(variant) for variant in VARIANTS[5:]]
     assert outcomes[0].failure == "could not be meshed: no mesh with 0.5 of the nodes"

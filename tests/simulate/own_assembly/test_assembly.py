@@ -308,6 +308,22 @@ def test_the_solver_goes_straight_to_a_frame(tmp_path):
         solver_outcomes(out, "test", [0], progress=False)
 
 
+def test_with_friction_only_the_walk_ends_at_the_dataset(tmp_path):
+    """The punch comes down, then rubs sideways; half of the frames are kept. A straight path has not rubbed."""
+    there = "[[0, 0, 0], [0, 0, '-travel'], ['travel', 0, '-travel']]"
+    spec = SPEC.replace("[0, 0, '-travel']", there).replace("frames = 3", "frames = 9\nfriction = 0.4")
+    path, out = write_assembly(tmp_path, spec), tmp_path / "rubbed.h5"
+    generate("assembly", out, spec=path, train=0, valid=0, test=1, keep=(2, 4, 6, 8), workers=1, progress=False)
+    variants = (VARIANTS[0], SolverVariant("frame by frame", every_frame=True))
+    assert variants[1] in VARIANTS
+    (found,) = solver_outcomes(
+        out, "test", [0], lambda _: 4, variants=variants, starts=(1,), made_from=path, progress=False
+    )
+    straight, stepped = found.outcomes
+    assert stepped.converged and stepped.relative_error < 1e-6 and stepped.start == 0
+    assert straight.relative_error > 0.02
+
+
 def test_a_draw_that_cannot_stand_is_drawn_again(tmp_path):
     """Both ends of each range are fine, but not where they come together."""
     spec = SPEC.replace("[0.5, 1.5]", "[0.5, 1.5]\na = [0, 0.22]\nb = [0, 0.22]")

@@ -25,53 +25,32 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
-import scipy.sparse
 
 from ast_sim.mechanics.elements.elasticity import Deformation, upright
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean
 from ast_sim.mechanics.elements.second_order import elastic_body
 from ast_sim.mechanics.linear_algebra.compliance import Compliance, compliance_of
 from ast_sim.mechanics.linear_algebra.linear_system import LinearSystem
+from ast_sim.mechanics.linearised.near_pairs import NearPairs, NearSurfaces
 from ast_sim.scene import Scene
 from ast_sim.support.errors import SimulationError
-from ast_sim.support.nearest_surface import nearest_surface
 
 CLEARANCE = (
     0.8  # bodies that barriers keep apart stand off by this share of the barriers' range (docs/log.md, 2026-11-24)
 )
-NEAR = 0.5  # pairs with a gap below this may touch, in mean edge lengths of the surfaces
-DEEP = 2.0  # a node deeper inside another body than this is not taken for one in contact with it, in the same
-OVERLAP = 1e-6  # pairs may overlap by this much at the end of a step, in the same
+OVERLAP = 1e-6  # pairs may overlap by this much at the end of a step, in mean edge lengths of the surfaces
 FEW = 16  # a round takes at least this number of the pairs that would overlap,
 SHARE = 4  # or this part of them,
 MORE = 16  # or this part of all that were taken before, if that is more
 ROUNDED = 1e-12  # an overlap of this part of the deepest is rounding
 PATIENCE, MOST_PIVOTS = 3, 30  # turns of all wrong pairs without fewer of them; turns in all, for each pair
-SLID = 0.02  # surfaces have slid along this last part of the path from rest to x, if nothing else is known
 SWEEPS, CHANGE = 100, 1e-3  # forces of friction are found when a sweep over the pairs changes them by less
 TINY = 1e-300  # instead of zero in a denominator
 STILL = 0.05  # a step of this size (`NewtonSteps.size`) or less is the last one (docs/log.md, 2026-11-25)
 SLIGHT = 1e-3  # a displacement below this, in mean edge lengths, is none: before bodies touch, only rounding is left
 SMALLEST = 1 / 64  # a step is shortened at most so far where it turns an element over
-
-
-@dataclass(frozen=True, eq=False)
-class NearPairs:
-    """Surface nodes near triangles of other bodies.
-
-    Attributes:
-        directions: [3 P, F] sparse, the derivatives by the free dofs of each pair's gap, then of its slip along one
-            tangent, then along the other.
-        gap: [P], negative where the node lies inside the other body.
-        slip: [2 P], how far the node has slid along one tangent, then along the other.
-    """
-
-    directions: scipy.sparse.csr_array
-    gap: np.ndarray
-    slip: np.ndarray
 
 
 class NewtonSteps:
@@ -86,6 +65,7 @@ class NewtonSteps:
     Attributes:
         elasticity: the deforming bodies.
         system: of their free nodes.
+        surfaces: of all bodies, derived by the free dofs.
         watch: is called now and then in a step, with how many forces of contact it knows. It may raise to stop.
 
     Raises:
@@ -102,16 +82,10 @@ class NewtonSteps:
         held[elements] = False
         held |= scene.prescribed
         self.system = LinearSystem(self.elasticity.entries(), held)
-        self._number = np.full(3 * scene.num_nodes, -1)
-        self._number[self.system.free] = np.arange(len(self.system.free))
-        faces = scene.surface().astype(np.int64)
-        owner, edge = scene.body[faces[:, 0]], self._rest[faces[:, 0]] - self._rest[faces[:, 1]]
-        self._length = float(np.linalg.norm(edge, axis=1).mean())
-        nodes = np.unique(faces)
+        self.surfaces = NearSurfaces(scene, self.system.free)
         self.watch: Callable[[int], None] = lambda forces: None
         self._shortening = 1.0  # the share of the last step that was made
         self._evaluated: tuple[np.ndarray, Deformation] | None = None
-        self._surfaces = [(faces[owner == body], nodes[scene.body[nodes] != body]) for body in np.unique(owner)]
 
     def step(self, position: np.ndarray, from_afar: bool = False, stuck: np.ndarray | None = None) -> np.ndarray:
         """The positions [N, 3] after one step from `position` [N, 3], float64.
@@ -138,7 +112,7 @@ class NewtonSteps:
         """See `step`."""
         deformation = upright(self._deformation(position))
         force = self.elasticity.gradient(deformation)[0].ravel()[self.system.free]
-        pairs = self.near_pairs(position, stuck)
+        pairs = self.surfaces.pairs(position, stuck)
         directions = pairs.directions if self._friction else pairs.directions[: len(pairs.gap)]
         for project in (True,) if from_afar else (False, True):
             values = self.elasticity.hessian(deformation, project)
@@ -162,9 +136,9 @@ class NewtonSteps:
         of the whole one: where elements stop it, it has not converged."""
         free = self.system.free
         move, displacement = ((after - start).ravel()[free] for start in (before, self._rest))
-        slight = SLIGHT * self._length * math.sqrt(len(free))
+        slight = SLIGHT * self.surfaces.length * math.sqrt(len(free))
         share = np.linalg.norm(move) / max(np.linalg.norm(displacement), slight)
-        return float(max(np.abs(move).max() / self._length, share)) / self._shortening
+        return float(max(np.abs(move).max() / self.surfaces.length, share)) / self._shortening
 
     def _constrained(self, compliance: Compliance, force: np.ndarray, pairs: NearPairs) -> np.ndarray:
         """The displacement [F] of the free dofs; see the head of this file."""
@@ -196,7 +170,7 @@ class NewtonSteps:
         forces = np.zeros(0)
         gap = offset.copy()
         while True:
-            missing = np.flatnonzero(gap < -OVERLAP * self._length)
+            missing = np.flatnonzero(gap < -OVERLAP * self.surfaces.length)
             if not len(missing):
                 return chosen, forces
             most = len(missing) if compliance.is_whole else max(FEW, len(missing) // SHARE, len(chosen) // MORE)
@@ -216,58 +190,6 @@ class NewtonSteps:
         of_elements[self._deforming, 0] = stress
         return of_elements
 
-    def near_pairs(self, position: np.ndarray, stuck: np.ndarray | None = None) -> NearPairs:
-        """The pairs that may touch at `position` [N, 3]: a surface node and its nearest point of another body. They
-        have slid from where they were at `stuck` [N, 3]; see `step`."""
-        import igl  # takes 0.2 s
-
-        nodes, corners, normals, shares, gaps = [], [], [], [], []
-        deep, near = DEEP * self._length, NEAR * self._length
-        for faces, others in self._surfaces:
-            nearest = nearest_surface(position[others], position, faces, inside=deep, outside=near)
-            if not len(nearest.rows):
-                continue
-            corner_positions = (position[nearest.triangles[:, i]] for i in range(3))
-            nodes.append(others[nearest.rows])
-            corners.append(nearest.triangles)
-            normals.append(nearest.normal)
-            shares.append(igl.barycentric_coordinates(nearest.place, *corner_positions))
-            gaps.append(nearest.gap)
-        if not gaps:
-            return NearPairs(scipy.sparse.csr_array((0, len(self.system.free))), np.zeros(0), np.zeros(0))
-        joined = (np.concatenate(parts) for parts in (nodes, corners, normals, shares, gaps))
-        slid = SLID * (position - self._rest) if stuck is None else position - stuck
-        return self._pairs(*joined, slid=slid)
-
-    def _pairs(
-        self,
-        nodes: np.ndarray,
-        corners: np.ndarray,
-        normals: np.ndarray,
-        shares: np.ndarray,
-        gaps: np.ndarray,
-        slid: np.ndarray,
-    ) -> NearPairs:
-        """Pairs of nodes [P] and triangles [P, 3] with their normals, barycentric coordinates [P, 3] and gaps [P]; the
-        nodes have moved by `slid` [N, 3] since the pairs stuck."""
-        of_pair = np.concatenate([nodes[:, None], corners], axis=1)  # [P, 4]
-        weight = np.concatenate([np.ones((len(nodes), 1)), -shares], axis=1)
-        columns = self._number[3 * of_pair[:, :, None] + np.arange(3)]  # [P, 4, 3]
-        movable = (columns >= 0).any(axis=(1, 2))
-        of_pair, columns, weight, normals = of_pair[movable], columns[movable], weight[movable], normals[movable]
-        tangents = _tangents(normals)
-        axes = np.concatenate([normals, *tangents])
-        rows = np.arange(3 * len(normals))
-        values = np.tile(weight, (3, 1))[:, :, None] * axes[:, None, :]
-        columns = np.tile(columns, (3, 1, 1))
-        free = columns >= 0
-        rows = np.broadcast_to(rows[:, None, None], columns.shape)
-        entries = values[free], (rows[free], columns[free])
-        directions = scipy.sparse.csr_array(entries, shape=(len(axes), len(self.system.free)))
-        relative = np.einsum("pk,pki->pi", weight, slid[of_pair])
-        slip = np.concatenate([np.einsum("pi,pi->p", relative, tangent) for tangent in tangents])
-        return NearPairs(directions, gaps[movable], slip)
-
     def _shortened(self, position: np.ndarray, step: np.ndarray) -> np.ndarray:
         """`position` [N, 3] moved by the largest of 1, 1/2, 1/4, ... of `step` [F] that turns no element over."""
         share = 1.0
@@ -279,14 +201,6 @@ class NewtonSteps:
             if share <= SMALLEST or self._deformation(moved).J.min() > 0:
                 return moved
             share /= 2
-
-
-def _tangents(normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two unit vectors [P, 3] that are perpendicular to each of the normals [P, 3] and to each other."""
-    across = np.eye(3)[np.abs(normals).argmin(axis=1)]
-    first = np.cross(normals, across)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    return first, np.cross(normals, first)
 
 
 def _pressed(compliance: np.ndarray, offset: np.ndarray) -> np.ndarray:
