@@ -26,11 +26,9 @@ from ast_sim.mechanics.elements.second_order import elastic_body
 from ast_sim.mechanics.linearised.contact_forces import ContactForces
 from ast_sim.scene import Scene
 
-REACH = 1.0  # a node counts as touched if another body is nearer than this, in mean edge lengths
+REACH = 1.0  # a node counts as touched if another body is nearer than this, in mean lengths of the edges around it
 OPPOSITE = 0.5  # cosine between opposite normals, at most; at an edge, a normal is the mean of its faces
-EXPLAINED = (
-    0.2  # contact must explain the elastic forces on free nodes up to this share; else nothing is in equilibrium
-)
+EXPLAINED = 0.4  # held nodes get their share where contact leaves less than this of the elastic forces on free nodes
 SMOOTH = 1e-3  # residual to which the smooth field is computed; every field is exact at equilibrium
 
 
@@ -59,8 +57,7 @@ class Reaction:
         surface = scene.surface()
         owner = scene.body[surface[:, 0]]  # a node of no element may be a body without a surface
         self._surfaces = {int(n): surface[owner == n] for n in np.unique(owner)}
-        a, b = surface[:, [0, 1]].T
-        self._reach = REACH * float(np.linalg.norm(self._rest[a] - self._rest[b], axis=1).mean())
+        self._reach = REACH * _edge_length(self._rest, surface)
         self._deforming = np.zeros(scene.num_nodes, bool)
         self._deforming[scene.elements[soft]] = True
 
@@ -81,37 +78,41 @@ class Reaction:
     def shares(self, position: np.ndarray) -> np.ndarray:
         """[N,3] w_i f_i, the share of each node in that force, and what contact brings straight into held nodes."""
         position = position.astype(np.float64)
-        source, sink = self._ends(position)
+        pairs = None if self._contact is None else self._contact.directions(position)
+        source, sink = self._ends(position, pairs)
         if not source.any():
             return np.zeros_like(position)
         forces, _ = self._elasticity.gradient(self._elasticity.evaluate(position))
         shares = self._field(source, sink, self._folds(position))[:, None] * forces
-        return shares if self._contact is None else shares + self._straight(self._contact, position, forces)
+        if self._contact is None or pairs is None:
+            return shares
+        return shares + self._straight(self._contact, pairs, forces)
 
-    def _straight(self, contact: ContactForces, position: np.ndarray, forces: np.ndarray) -> np.ndarray:
+    def _straight(self, contact: ContactForces, pairs: scipy.sparse.csr_array, forces: np.ndarray) -> np.ndarray:
         """[N,3] the forces of contact between the driven body and held nodes, where elastic `forces` [N,3] show them; 0
-        elsewhere, and on positions that are no equilibrium."""
+        elsewhere, and on positions that are no equilibrium. `pairs` are the directions of contact."""
         of_body = self.scene.body == self.driven.body
         pushes_others = self.driven.body in self.scene.rigid_bodies
         held = self.scene.prescribed & self._deforming & ~of_body if pushes_others else self.driven.nodes
-        directions = contact.directions(position)
-        straight = _of(directions, held) & _of(directions, of_body)
-        none = np.zeros_like(position)
+        straight = _of(pairs, held) & _of(pairs, of_body)
+        none = np.zeros_like(forces)
         if not straight.any():
             return none
-        sizes = contact.sizes(directions, forces)
+        sizes = contact.sizes(pairs, forces)
         elastic = forces.ravel()[contact.free]
-        left = elastic - (directions.T @ sizes)[contact.free]
+        left = elastic - (pairs.T @ sizes)[contact.free]
         if np.linalg.norm(left) > EXPLAINED * np.linalg.norm(elastic):
             return none
-        pushed = (directions[straight].T @ sizes[straight]).reshape(-1, 3)
+        pushed = (pairs[straight].T @ sizes[straight]).reshape(-1, 3)
         return np.where(held[:, None], pushed if pushes_others else -pushed, none)
 
-    def _ends(self, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _ends(self, position: np.ndarray, pairs: scipy.sparse.csr_array | None) -> tuple[np.ndarray, np.ndarray]:
         """[N] bool twice: the deforming nodes on which the moved nodes act, and all others that are held or touched."""
         scene = self.scene
         driven = self.driven
         nearest = self._nearest_body(position)
+        if pairs is not None:
+            nearest = self._with_touched_corners(nearest, pairs)
         held = scene.prescribed & self._deforming
         touched = (nearest == driven.body) & ~held
         source = touched if driven.body in scene.rigid_bodies else held & driven.nodes
@@ -122,11 +123,11 @@ class Reaction:
         import igl
 
         nearest_body = np.full(len(position), -1)
-        nearest = np.full(len(position), self._reach**2)
+        nearest, farthest = self._reach**2, self._reach.max()
         for body, faces in self._surfaces.items():
             used, local = np.unique(faces, return_inverse=True)
             local = local.reshape(-1, 3)
-            low, high = position[used].min(axis=0) - self._reach, position[used].max(axis=0) + self._reach
+            low, high = position[used].min(axis=0) - farthest, position[used].max(axis=0) + farthest
             for other, theirs in self._surfaces.items():
                 nodes = np.unique(theirs)
                 nodes = nodes[self._deforming[nodes] & ((position[nodes] > low) & (position[nodes] < high)).all(axis=1)]
@@ -136,6 +137,16 @@ class Reaction:
                 closer = square < nearest[nodes]
                 nearest_body[nodes[closer]], nearest[nodes[closer]] = body, square[closer]
         return nearest_body
+
+    def _with_touched_corners(self, nearest: np.ndarray, pairs: scipy.sparse.csr_array) -> np.ndarray:
+        """`nearest` [N], and for deforming nodes that are near nothing themselves the body that touches a face or an
+        edge of theirs. In coarse meshes a tool stands on a face whose corners are out of reach."""
+        body = self.scene.body
+        for other in self._surfaces:
+            of_pairs = np.flatnonzero(_of(pairs, body == other))
+            touched = abs(pairs[of_pairs]).sum(axis=0).reshape(-1, 3).any(axis=1)
+            nearest = np.where(touched & (body != other) & self._deforming & (nearest < 0), other, nearest)
+        return nearest
 
     def _folds(self, position: np.ndarray) -> np.ndarray:
         """[2, P] pairs of nodes of a deforming body whose surfaces look at each other across a gap within reach, and
@@ -148,7 +159,9 @@ class Reaction:
             nodes = np.unique(faces)
             nodes = nodes[self._deforming[nodes]]
             if len(nodes):
-                pairs.append(nodes[KDTree(position[nodes]).query_pairs(self._reach, output_type="ndarray")])
+                pairs.append(
+                    nodes[KDTree(position[nodes]).query_pairs(self._reach[nodes].mean(), output_type="ndarray")]
+                )
         first, second = np.concatenate(pairs).T
         between, before = position[second] - position[first], self._rest[second] - self._rest[first]
         facing = np.einsum("pi,pi->p", outward[first] - outward[second], between) > 0
@@ -189,3 +202,11 @@ class Reaction:
 def _of(directions: scipy.sparse.csr_array, nodes: np.ndarray) -> np.ndarray:
     """[P] bool: which of the directions [P, 3 N] move one of the nodes, [N] bool."""
     return abs(directions) @ np.repeat(nodes, 3).astype(float) > 0
+
+
+def _edge_length(rest: np.ndarray, surface: np.ndarray) -> np.ndarray:
+    """[N] the mean length of the edges around each node of a surface [F,3]; 0 at nodes inside."""
+    ends = surface[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    lengths = np.repeat(np.linalg.norm(rest[ends[:, 0]] - rest[ends[:, 1]], axis=1), 2)
+    total, count = (np.bincount(ends.ravel(), weights, minlength=len(rest)) for weights in (lengths, None))
+    return total / np.maximum(count, 1)
