@@ -123,7 +123,8 @@ class Reaction:
         import igl
 
         nearest_body = np.full(len(position), -1)
-        nearest, farthest = self._reach**2, self._reach.max()
+        nearest = self._reach**2
+        farthest = self._reach.max()
         for body, faces in self._surfaces.items():
             used, local = np.unique(faces, return_inverse=True)
             local = local.reshape(-1, 3)
