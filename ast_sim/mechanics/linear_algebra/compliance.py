@@ -73,7 +73,7 @@ def compliance_of(
     count = len(directions.indptr) - 1
     if not (system.condenses and condensation_pays(count, len(touched), len(system.free))):
         factor = system.factorise(values)
-        return None if factor is None else ByColumns(factor, len(system.free), directions, watch)
+        return None if factor is None else ByColumns(factor, directions, watch)
     condensed = system.condense(values, touched)
     if condensed is None:
         return None
@@ -93,21 +93,14 @@ class ByColumns:
 
     Args:
         factor: of K.
-        unknowns: F.
         directions, watch: see `compliance_of`.
     """
 
     is_whole = False
 
-    def __init__(
-        self,
-        factor: Factorization,
-        unknowns: int,
-        directions: scipy.sparse.csr_array,
-        watch: Callable[[int], None],
-    ) -> None:
-        self._factor, self._unknowns = factor, unknowns
-        self._directions, self._watch = directions, watch
+    def __init__(self, factor: Factorization, directions: scipy.sparse.csr_array, watch: Callable[[int], None]) -> None:
+        self._factor, self._directions, self._watch = factor, directions, watch
+        self._unknowns = directions.shape[1]  # pyright: ignore[reportOptionalSubscript], of scipy
         self._parts: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []  # unknowns, lefts and rights of some columns
         self._products = np.zeros((0, 0))
 

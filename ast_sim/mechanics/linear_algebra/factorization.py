@@ -52,10 +52,6 @@ class Factorization(Protocol):
         ...
 
 
-def _unknowns_of(upper: scipy.sparse.csr_array) -> int:
-    return len(upper.indptr) - 1
-
-
 @functools.cache
 def _pypardiso() -> tuple[ModuleType, str]:
     """The module, ready for use, and its name and version."""
@@ -94,7 +90,7 @@ class Pardiso:
         """See `condense`; without kept unknowns there is nothing in the array."""
         self._matrix = upper
         is_new = is_new_pattern or self._kept is None or not np.array_equal(kept, self._kept)
-        unknowns = _unknowns_of(upper)
+        unknowns = len(upper.indptr) - 1
         try:
             if is_new:
                 self._analyse(upper, kept)
@@ -110,7 +106,7 @@ class Pardiso:
         if self._kept is not None:
             self._free()
         self._kept = kept
-        unknowns = _unknowns_of(upper)
+        unknowns = len(upper.indptr) - 1
         self._solver = self._pypardiso.PyPardisoSolver(mtype=2)  # real, symmetric, positive definite
         # MKL keeps the factor until it is told.
         self._free = weakref.finalize(self, self._solver.free_memory, everything=True)
