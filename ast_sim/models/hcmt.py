@@ -28,7 +28,7 @@ from ast_sim.batches.batch_builder import Batch
 from ast_sim.batches.graph import Graph
 from ast_sim.models.bistride import build_hierarchy, subset
 from ast_sim.models.layers import layer
-from ast_sim.models.model_config import PAPER_TRAINING, Preset, count, setting, tiny
+from ast_sim.models.model_config import PAPER_TRAINING, Preset, check_heads, count, setting, tiny
 from ast_sim.models.registry import Model
 from ast_sim.models.simulator import Prediction
 from ast_sim.models.world_edge_model import Decoder, Edges, WorldEdgeConfig, WorldEdgeSimulator
@@ -48,7 +48,7 @@ class HCMTConfig(WorldEdgeConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.check_heads()
+        check_heads(self.hidden, self.heads)
 
 
 class MeshTransformerBlock(nn.Module):

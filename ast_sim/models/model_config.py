@@ -10,7 +10,7 @@ from ast_sim.batches.scheme import Scheme
 from ast_sim.models.data_facts import DataFacts
 from ast_sim.named_field import REACTION, Output
 from ast_sim.support.errors import ConfigError
-from ast_sim.support.toml_settings import FROM_DATA, LARGEST, require_range
+from ast_sim.support.toml_settings import FROM_DATA, LARGEST, known, require_range
 
 WIDEST = 1 << 16  # the largest width or count of a layer
 
@@ -29,6 +29,12 @@ def setting(default: Any, text: str, least: float | None = None, most: float = L
 def count(default: int | None, text: str, least: int = 1) -> Any:
     """A `setting` that counts something, such as blocks or the width of a layer."""
     return setting(default, text, least, WIDEST)
+
+
+def check_heads(hidden: int, heads: int) -> None:
+    """Raise ConfigError unless the width is a multiple of the number of heads."""
+    if hidden % heads:
+        raise ConfigError(f"model.hidden = {hidden} must be a multiple of model.heads = {heads}")
 
 
 @dataclass(frozen=True)
@@ -80,11 +86,6 @@ class ModelConfig:
         if "velocity" in inputs and not self.data.dynamic:
             raise ConfigError(f"model.{key}: velocity is an input of dynamic scenes only")
 
-    def check_heads(self) -> None:
-        """Raise ConfigError unless the width is a multiple of the number of heads."""
-        if self.hidden % self.heads:
-            raise ConfigError(f"model.hidden = {self.hidden} must be a multiple of model.heads = {self.heads}")
-
     @property
     def gains_along_rollouts(self) -> bool:
         """Whether an unset `train.rollout_pool` becomes a pool. With inertia, rollouts diverge without one
@@ -99,8 +100,9 @@ class ModelConfig:
     @property
     def graph_parts(self) -> dict[str, Any]:
         """The parts of the graph that the inputs need: arguments of `Graph.from_scene`."""
-        elastic = "out_of_balance" in self.node_inputs
-        return {"surface": "proximity" in self.node_inputs, "elastic": self.data.material if elastic else None}
+        inputs = known(self.node_inputs)
+        elastic = "out_of_balance" in inputs
+        return {"surface": "proximity" in inputs, "elastic": self.data.material if elastic else None}
 
     @property
     def scheme(self) -> Scheme:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 Kind = Literal["vector", "scalar"]
+Columns = tuple[Kind | None, int]  # a quantity and its number of columns; one of kind None is not changed
 
 
 class Statistics:
@@ -80,10 +81,10 @@ class FeatureNormalizer(Normalizer):
     """A `Normalizer` for several quantities in the columns of one array.
 
     Args:
-        kinds: (kind, width) of each quantity, in the order of the columns. A quantity of kind None is not changed.
+        kinds: of each quantity, in the order of the columns.
     """
 
-    def __init__(self, kinds: list[tuple[Kind | None, int]]):
+    def __init__(self, kinds: list[Columns]):
         width = sum(width for _, width in kinds)
         super().__init__(None, (width,))
         self.width = width

@@ -25,7 +25,7 @@ from torch import Tensor, nn
 from ast_sim.batches.batch_builder import Batch
 from ast_sim.batches.graph import Graph
 from ast_sim.models.layers import Linear
-from ast_sim.models.model_config import Preset, ProximityConfig, count, setting, tiny
+from ast_sim.models.model_config import Preset, ProximityConfig, check_heads, count, setting, tiny
 from ast_sim.models.node_inputs import node_features, normalizer_of
 from ast_sim.models.normalizer import FeatureNormalizer, Normalizer
 from ast_sim.models.registry import Model
@@ -49,7 +49,7 @@ class TransolverConfig(ProximityConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.check_heads()
+        check_heads(self.hidden, self.heads)
 
 
 class GeluMLP(nn.Module):

@@ -93,7 +93,7 @@ class WorldEdgeSimulator(Simulator):
         meshes = [(graph.edges, graph.rest_edges, now)] if graph.own is None else graph.own.meshes(now)
         on_mesh, on_world = [], []
         for level, (edges, rest, position) in enumerate(meshes):
-            features = edge_features(self.config, edges, rest, position, position)
+            features = edge_features(edges, rest, position, position, self.config.edge_strain)
             on_mesh.append((edges, use(_of_level(self.mesh_inputs, level), features)))
         for level, edges in enumerate(self.contacts(batch)):
             position = meshes[level][2]

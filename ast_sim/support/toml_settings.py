@@ -39,6 +39,12 @@ class SettingHelp:
     help: str
 
 
+def known(value: T | None) -> T:
+    """A value that is None only until settings are resolved, or in a scene that they do not fit."""
+    assert value is not None, "the settings are not resolved, or do not fit the scene"
+    return value
+
+
 def settings(cls: type, given: Mapping[str, Any] = NOTHING) -> Iterator[SettingHelp]:
     """All settings of a dataclass and of its nested dataclasses, in order. A field's metadata `help` is its help.
 

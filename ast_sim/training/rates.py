@@ -5,11 +5,9 @@ from __future__ import annotations
 import hashlib
 import math
 from dataclasses import dataclass
-from typing import TypeVar
 
 from ast_sim.runs.train_config import TrainConfig
-
-T = TypeVar("T")
+from ast_sim.support.toml_settings import known
 
 
 @dataclass(frozen=True)
@@ -27,12 +25,12 @@ class Schedule:
     def of(config: TrainConfig) -> Schedule:
         """Of resolved settings."""
         return Schedule(
-            steps=_known(config.steps),
-            peak_rate=_known(config.peak_rate),
-            warmup=_known(config.warmup),
-            decay=_known(config.decay),
-            validate_every=_known(config.validate_every),
-            checkpoint_every=_known(config.checkpoint_every),
+            steps=known(config.steps),
+            peak_rate=known(config.peak_rate),
+            warmup=known(config.warmup),
+            decay=known(config.decay),
+            validate_every=known(config.validate_every),
+            checkpoint_every=known(config.checkpoint_every),
         )
 
     def rate(self, step: int) -> float:
@@ -45,11 +43,6 @@ class Schedule:
             return self.peak_rate * (1e-4 + (1 - 1e-4) * step / self.warmup)
         phase = (step - self.warmup) / max(1, self.decay - self.warmup)
         return 0.5 * self.peak_rate * (1 + math.cos(math.pi * min(1.0, phase)))
-
-
-def _known(value: T | None) -> T:
-    assert value is not None, "the settings of the training are not resolved"
-    return value
 
 
 def step_seed(seed: int, step: int) -> int:

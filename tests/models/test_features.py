@@ -1,5 +1,7 @@
 """Input features by hand: two tetrahedra over the face 1, 2, 3, with their tips at the nodes 0 and 4."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -9,8 +11,15 @@ from ast_sim.batches.batch_builder import Batch
 from ast_sim.batches.graph import Graph
 from ast_sim.models.ast.ast_config import ASTConfig
 from ast_sim.models.data_facts import DataFacts
-from ast_sim.models.node_inputs import edge_features, element_features, node_features, normalizer_of
+from ast_sim.models.node_inputs import (
+    edge_features,
+    element_features,
+    element_normalizer,
+    node_features,
+    normalizer_of,
+)
 from ast_sim.models.normalizer import FeatureNormalizer
+from ast_sim.support.errors import ConfigError
 
 
 def batch_of(element_nodes: bool) -> Batch:
@@ -40,27 +49,35 @@ def test_node_features():
 
 def test_element_features():
     inputs = ("displacement", "velocity", "material", "stress")
-    config = ASTConfig(
-        element_inputs=inputs, data=DataFacts(columns=("stiffness",), integration="dynamic", stress="element")
-    )
+    config = ASTConfig(data=DataFacts(columns=("stiffness",), integration="dynamic", stress="element"))
     batch = batch_of(True)
     expected = torch.tensor([[0.1, 0, 0, 0.05, 0, 0, 2, 5], [0.125, 0, 0, 0.0625, 0, 0, 6, 7]])
-    torch.testing.assert_close(element_features(config, batch), expected, rtol=0, atol=1e-6)
-    assert normalizer_of(config, "element").width == 8
+    torch.testing.assert_close(element_features(inputs, batch), expected, rtol=0, atol=1e-6)
+    assert element_normalizer(config, inputs).width == 8
 
 
 @pytest.mark.parametrize("strain", [False, True])
 @pytest.mark.parametrize("element_nodes", [False, True])
 def test_edge_features(element_nodes, strain):
-    config, batch = ASTConfig(edge_strain=strain), batch_of(element_nodes)
+    config, batch = ASTConfig(), batch_of(element_nodes)
     graph, rest, now = batch.graph, batch.graph.rest_position, batch.position
     senders = graph.element_mean(now) if element_nodes else now
-    found = edge_features(config, graph.edges, graph.rest_edges, senders, now)
+    found = edge_features(graph.edges, graph.rest_edges, senders, now, strain)
     assert found.shape == (len(graph.edges), 8) and normalizer_of(config, "edge").width == 8
     for row, s, r in zip(found, graph.edges.senders.tolist(), graph.edges.receivers.tolist(), strict=True):
         ends = [(x[graph.elements[s]].mean(dim=0) if element_nodes else x[s]) - x[r] for x in (rest, now)]
         first, second = (torch.cat([d, d.norm()[None]]) for d in ends)
         torch.testing.assert_close(row, torch.cat([first, second - first if strain else second]))
+
+
+def test_settings_and_scenes_lack_nothing_that_is_an_input():
+    config, batch = ASTConfig(node_inputs=("material",)), batch_of(False)
+    without = replace(batch, graph=replace(batch.graph, node_material=None))
+    for settings, scenes in ((replace(config, node_inputs=None), batch), (config, without)):
+        with pytest.raises(AssertionError, match="the settings are not resolved, or do not fit the scene"):
+            node_features(settings, scenes)
+    with pytest.raises(ConfigError, match="there are no features of 'world edge'.*world_edge"):
+        normalizer_of(config, "world edge")
 
 
 def test_columns_are_normalised_by_their_kind():

@@ -9,6 +9,7 @@ from typing import Literal, Self
 from ast_sim.models.data_facts import DataFacts
 from ast_sim.models.model_config import NODE_INPUTS, ProximityConfig, count, setting
 from ast_sim.support.errors import ConfigError
+from ast_sim.support.toml_settings import known
 
 CELL_SPACINGS = 1.5  # an unset side of a cell, in mesh spacings
 
@@ -74,8 +75,7 @@ class ASTConfig(ProximityConfig):
     @property
     def level(self) -> int:
         """`L_cell` of resolved settings."""
-        assert self.L_cell is not None, "the settings of the model are not resolved"
-        return self.L_cell
+        return known(self.L_cell)
 
     @property
     def cell_side(self) -> float:

@@ -23,7 +23,7 @@ from ast_sim.models.ast.message_passing import MessagePassing
 from ast_sim.models.ast.position_embedding import PositionEmbedding, rotations
 from ast_sim.models.ast.transformer import AttentionBlock, Vectors
 from ast_sim.models.layers import MLP, Linear
-from ast_sim.models.node_inputs import edge_features, element_features, node_features, normalizer_of
+from ast_sim.models.node_inputs import edge_features, element_features, element_normalizer, node_features, normalizer_of
 from ast_sim.models.normalizer import Normalizer
 from ast_sim.models.simulator import Latent, Prediction, Simulator, Use
 from ast_sim.ops import farthest_point_sample, segment_mean
@@ -42,7 +42,7 @@ class AST(Simulator):
         self.edge_inputs = normalizer_of(c, "edge")
         self.node_encoder = MLP(self.node_inputs.width, width, width, c.factorized)
         if c.element_inputs:
-            self.element_inputs = normalizer_of(c, "element")
+            self.element_inputs = element_normalizer(c, c.element_inputs)
             self.element_encoder = MLP(self.element_inputs.width, width, width, c.factorized)
             self.e2m = self._message_passing("e2m", self.edge_inputs.width)
         else:
@@ -89,9 +89,9 @@ class AST(Simulator):
         config, graph, now = self.config, batch.graph, batch.position
         elements, senders = None, now
         if config.element_inputs:
-            elements = use(self.element_inputs, element_features(config, batch))
+            elements = use(self.element_inputs, element_features(config.element_inputs, batch))
             senders = graph.element_mean(now)
-        edges = edge_features(config, graph.edges, graph.rest_edges, senders, now)
+        edges = edge_features(graph.edges, graph.rest_edges, senders, now, config.edge_strain)
         return use(self.node_inputs, node_features(config, batch)), use(self.edge_inputs, edges), elements
 
     def forward(self, batch: Batch) -> Prediction:
