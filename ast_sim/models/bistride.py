@@ -28,7 +28,7 @@ from scipy.sparse import csr_array, diags_array, eye_array, tril, triu
 from scipy.sparse.csgraph import connected_components, dijkstra
 from torch import Tensor
 
-from ast_sim.batches.graph import edge_vectors
+from ast_sim.batches.graph import Graph, edge_vectors
 from ast_sim.batches.mirror_and_shift import Placement
 from ast_sim.ops import EdgeSet, join_indices, offsets_of, segment_spread, segment_sum
 from ast_sim.ops.spec import segment_of
@@ -96,6 +96,12 @@ class Hierarchy:
     rest_edges: tuple[Tensor, ...]
     poolings: tuple[Pooling, ...]
     component: Tensor
+
+    @staticmethod
+    def of(graph: Graph) -> Hierarchy:
+        """What `build_hierarchy` made and the model put into the graph."""
+        assert isinstance(graph.own, Hierarchy)
+        return graph.own
 
     @staticmethod
     def concatenate(parts: Sequence[Hierarchy]) -> Hierarchy:
@@ -184,7 +190,7 @@ def _starts(position: np.ndarray) -> np.ndarray:
 
 def coarsen(adjacency: csr_array, kept: np.ndarray) -> csr_array:
     """[C, C] bool: (A + I)^2, rows and columns of kept nodes, without the diagonal."""
-    enhanced = (adjacency + eye_array(adjacency.shape[0], dtype=bool)).tocsr()
+    enhanced = (adjacency + eye_array(len(adjacency.indptr) - 1, dtype=bool)).tocsr()
     return _without_diagonal(enhanced[kept] @ enhanced[:, kept])
 
 
@@ -226,7 +232,9 @@ def _edge_set(matrix: csr_array) -> EdgeSet:
     """The inverse of `_matrix`."""
     matrix.sort_indices()
     offsets = torch.from_numpy(matrix.indptr.astype(np.int64))
-    return EdgeSet(torch.from_numpy(matrix.indices.astype(np.int64)), segment_of(offsets), offsets, matrix.shape[1])
+    senders = torch.from_numpy(matrix.indices.astype(np.int64))
+    num_senders = matrix.shape[1]  # pyright: ignore[reportOptionalSubscript], of scipy
+    return EdgeSet(senders, segment_of(offsets), offsets, num_senders)
 
 
 def _without_diagonal(matrix: csr_array) -> csr_array:

@@ -24,7 +24,7 @@ from torch import Tensor, nn
 
 from ast_sim.batches.batch_builder import Batch
 from ast_sim.batches.graph import Graph
-from ast_sim.models.bistride import build_hierarchy, subset
+from ast_sim.models.bistride import Hierarchy, build_hierarchy, subset
 from ast_sim.models.model_config import PAPER_TRAINING, Preset, count, setting, tiny
 from ast_sim.models.node_inputs import normalizer_of
 from ast_sim.models.registry import Model
@@ -48,10 +48,25 @@ class BSMSConfig(WorldEdgeConfig):
 class PlainNorm(nn.Module):
     """Weight 1 and bias 0 in place of the parameters of a LayerNorm."""
 
+    weight: Tensor
+    bias: Tensor
+
     def __init__(self, width: int):
         super().__init__()
         self.register_buffer("weight", torch.ones(width), persistent=False)
         self.register_buffer("bias", torch.zeros(width), persistent=False)
+
+
+class EdgeMessages(nn.Module):
+    """The sums of the messages along one set of edges."""
+
+    def __init__(self, config: BSMSConfig, edge_inputs: int):
+        super().__init__()
+        self.mlp = DeepMLP(config, edge_inputs + 2 * config.hidden, norm=PlainNorm)
+
+    def forward(self, edges: Edges, x: Tensor) -> Tensor:
+        """[N, hidden] -> [N, hidden]."""
+        return messages(self.mlp, *edges, x)[0]
 
 
 class MessagePassingBlock(nn.Module):
@@ -59,23 +74,16 @@ class MessagePassingBlock(nn.Module):
 
     def __init__(self, config: BSMSConfig):
         super().__init__()
-        self.mesh, self.contact = (  # `mlp`: its name in saved runs
-            nn.ModuleDict({"mlp": DeepMLP(config, edge_inputs + 2 * config.hidden, norm=PlainNorm)})
-            for edge_inputs in (8, 4)
-        )
+        self.mesh, self.contact = EdgeMessages(config, 8), EdgeMessages(config, 4)
         self.node = DeepMLP(config, 3 * config.hidden, norm=PlainNorm)
 
     def forward(self, x: Tensor, mesh: Edges, contacts: Edges) -> Tensor:
         """[N, hidden] -> [N, hidden]."""
-        on_mesh, _ = messages(self.mesh["mlp"], *mesh, x)
-        in_contact, _ = messages(self.contact["mlp"], *contacts, x)
-        return self.node(torch.cat([x, on_mesh, in_contact], dim=1), residual=x)
+        return self.node(torch.cat([x, self.mesh(mesh, x), self.contact(contacts, x)], dim=1), residual=x)
 
 
-class BSMS(WorldEdgeSimulator):
+class BSMS(WorldEdgeSimulator[BSMSConfig]):
     """BSMS-GNN. Edge lengths grow from level to level, so each level has statistics of its own."""
-
-    config: BSMSConfig
 
     def __init__(self, config: BSMSConfig):
         super().__init__(config)
@@ -99,18 +107,18 @@ class BSMS(WorldEdgeSimulator):
     def world(self, batch: Batch) -> EdgeSet:
         """The contact edges of the finest mesh."""
         edges = super().world(batch)
-        return batch.graph.own.between_components(edges) if self.config.contacts == "components" else edges
+        return Hierarchy.of(batch.graph).between_components(edges) if self.config.contacts == "components" else edges
 
     def contacts(self, batch: Batch) -> list[EdgeSet]:
         """The contact edges of each mesh, the finest first."""
-        poolings = batch.graph.own.poolings
+        poolings = Hierarchy.of(batch.graph).poolings
         return list(accumulate(poolings, lambda finer, step: step.pool_contacts(finer), initial=self.world(batch)))
 
     def forward(self, batch: Batch) -> Prediction:
         """Normalised outputs for the frame after `batch`."""
         nodes, *edges = self.inputs_of(batch)
         levels = list(zip(*edges, strict=True))
-        poolings = batch.graph.own.poolings
+        poolings = Hierarchy.of(batch.graph).poolings
         x = self.node_encoder(nodes)
         skipped = []
         for i, block in enumerate(self.down):
@@ -121,7 +129,7 @@ class BSMS(WorldEdgeSimulator):
             x = skipped[i] + self._steps(block, poolings[i].unpool(x), levels[i], end=i == 0)
         return self.decoder(x, batch)
 
-    def _steps(self, block: MessagePassingBlock, x: Tensor, level: tuple[Edges, Edges], end: bool) -> Tensor:
+    def _steps(self, block: nn.Module, x: Tensor, level: tuple[Edges, Edges], end: bool) -> Tensor:
         for _ in range(2 if end and self.config.repeat_ends else 1):
             x = block(x, *level)
         return x

@@ -26,7 +26,7 @@ from torch import Tensor, nn
 
 from ast_sim.batches.batch_builder import Batch
 from ast_sim.batches.graph import Graph
-from ast_sim.models.bistride import build_hierarchy, subset
+from ast_sim.models.bistride import Hierarchy, build_hierarchy, subset
 from ast_sim.models.layers import layer
 from ast_sim.models.model_config import PAPER_TRAINING, Preset, check_heads, count, setting, tiny
 from ast_sim.models.registry import Model
@@ -78,10 +78,8 @@ class MeshTransformerBlock(nn.Module):
         return last(second(first(self.forward_norm(x), "relu"), "relu"), residual=x)
 
 
-class HCMT(WorldEdgeSimulator):
+class HCMT(WorldEdgeSimulator[HCMTConfig]):
     """The Hierarchical Contact Mesh Transformer. The edges of all meshes share statistics."""
-
-    config: HCMTConfig
 
     def __init__(self, config: HCMTConfig):
         super().__init__(config)
@@ -110,7 +108,7 @@ class HCMT(WorldEdgeSimulator):
         """Normalised outputs for the frame after `batch`."""
         nodes, on_mesh, [(world, on_world)] = self.inputs_of(batch)
         meshes = [(edges, self.mesh_encoder(features)) for edges, features in on_mesh]
-        kept = [pooling.kept for pooling in batch.graph.own.poolings]
+        kept = [pooling.kept for pooling in Hierarchy.of(batch.graph).poolings]
         contacts = (world, self.world_encoder(on_world))
 
         x = self.node_encoder(nodes)
@@ -160,7 +158,8 @@ class _ChannelAttention(torch.autograd.Function):
         return segment_sum(messages, *edges.by_receiver)
 
     @staticmethod
-    def backward(ctx, dout: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
+        (dout,) = grad_outputs
         (q, k, v, p, g), edges, scale = ctx.saved_tensors, ctx.edges, ctx.scale
         dq, dk, dv, dp, dg = (torch.empty_like(p) for _ in range(5))  # one row for each edge
         for rows in _chunks(p):

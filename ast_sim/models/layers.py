@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import torch
 from torch import Tensor, nn
 
@@ -14,6 +16,16 @@ class Linear(nn.Linear):
     def forward(self, input: Tensor, activation: str = "none", residual: Tensor | None = None) -> Tensor:
         """input [M, inputs] -> [M, outputs], or half of them with "geglu"; residual has the shape of the result."""
         return linear(input, self.weight, self.bias, activation, residual)
+
+
+class Norm(Protocol):
+    """A LayerNorm, by its weight and bias."""
+
+    @property
+    def weight(self) -> Tensor: ...
+
+    @property
+    def bias(self) -> Tensor: ...
 
 
 class FactorizedLinear(nn.Module):
@@ -56,7 +68,7 @@ class MLP(nn.Module):
         self.second = layer(hidden, outputs, factorized)
 
     def forward(
-        self, x: Tensor, beside: Tensor | None = None, norm: nn.LayerNorm | None = None, residual: Tensor | None = None
+        self, x: Tensor, beside: Tensor | None = None, norm: Norm | None = None, residual: Tensor | None = None
     ) -> Tensor:
         """LN(W_2 relu(W_1 [x, beside] + b_1) + b_2) + residual, where `norm` is LN.
 

@@ -61,10 +61,8 @@ class GraphNetBlock(nn.Module):
         return self.node(torch.cat([nodes, mesh_sum, world_sum], dim=1), residual=nodes), on_mesh, on_world
 
 
-class MGN(WorldEdgeSimulator):
+class MGN(WorldEdgeSimulator[MGNConfig]):
     """MeshGraphNets."""
-
-    config: MGNConfig
 
     def __init__(self, config: MGNConfig):
         super().__init__(config)

@@ -7,21 +7,23 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import Generic, Self, TypeVar
 
 import torch
 from torch import Tensor, nn
 
 from ast_sim.batches.batch_builder import Batch
 from ast_sim.batches.graph import edge_vectors
+from ast_sim.models.bistride import Hierarchy
 from ast_sim.models.data_facts import DataFacts
-from ast_sim.models.layers import MLP, layer
+from ast_sim.models.layers import MLP, Norm, layer
 from ast_sim.models.model_config import ModelConfig, count, setting
 from ast_sim.models.node_inputs import edge_features, node_features, normalizer_of
 from ast_sim.models.normalizer import Normalizer
 from ast_sim.models.simulator import Latent, Prediction, Simulator, Use
 from ast_sim.models.world_edges import world_edges
 from ast_sim.ops import EdgeSet, linear, message_edges, mlp, segment_sum
+from ast_sim.support.toml_settings import known
 
 Edges = tuple[EdgeSet, Tensor]  # with the features of each edge
 
@@ -53,11 +55,15 @@ class WorldEdgeConfig(ModelConfig):
 
     def facts(self, length_unit: str, mesh_spacing: float | None = None) -> dict[str, str]:
         """See `ModelConfig`."""
-        share = f" = {self.world_radius / mesh_spacing:.2g} x mesh spacing" if mesh_spacing else ""
-        return {"World": f"edges up to {self.world_radius:.3g} {length_unit}{share}"}
+        radius = known(self.world_radius)
+        share = f" = {radius / mesh_spacing:.2g} x mesh spacing" if mesh_spacing else ""
+        return {"World": f"edges up to {radius:.3g} {length_unit}{share}"}
 
 
-class WorldEdgeSimulator(Simulator):
+Config = TypeVar("Config", bound=WorldEdgeConfig)
+
+
+class WorldEdgeSimulator(Simulator, Generic[Config]):
     """A model with mesh edges and world edges, and with the inputs of MeshGraphNets (section A.1).
 
     Nodes have their type, `node_inputs` and the boundary motion. Mesh edges [M, 8] have the differences of the rest
@@ -65,9 +71,9 @@ class WorldEdgeSimulator(Simulator):
     its length. If the graph's `own` is a `Hierarchy`, all its meshes have mesh edges.
     """
 
-    config: WorldEdgeConfig
+    config: Config
 
-    def __init__(self, config: WorldEdgeConfig):
+    def __init__(self, config: Config):
         super().__init__(config)
         self.node_inputs, self.mesh_inputs, self.world_inputs = (
             normalizer_of(config, what) for what in ("node", "edge", "world_edge")
@@ -81,7 +87,7 @@ class WorldEdgeSimulator(Simulator):
 
     def world(self, batch: Batch) -> EdgeSet:
         """The world edges of a batch."""
-        return world_edges(batch, self.config.world_radius, self.config.most_world_edges)
+        return world_edges(batch, known(self.config.world_radius), self.config.most_world_edges)
 
     def contacts(self, batch: Batch) -> list[EdgeSet]:
         """The world edges of each mesh that has some, the finest first."""
@@ -90,7 +96,8 @@ class WorldEdgeSimulator(Simulator):
     def inputs_of(self, batch: Batch, use: Use = Normalizer.__call__) -> tuple[Tensor, list[Edges], list[Edges]]:
         """See `Simulator`: of the nodes, and the mesh edges and world edges of each mesh, the finest first."""
         graph, now = batch.graph, batch.position
-        meshes = [(graph.edges, graph.rest_edges, now)] if graph.own is None else graph.own.meshes(now)
+        own = graph.own
+        meshes = own.meshes(now) if isinstance(own, Hierarchy) else [(graph.edges, graph.rest_edges, now)]
         on_mesh, on_world = [], []
         for level, (edges, rest, position) in enumerate(meshes):
             features = edge_features(edges, rest, position, position, self.config.edge_strain)
@@ -120,7 +127,9 @@ class WorldEdgeSimulator(Simulator):
 
 def _of_level(normalizers: nn.Module, level: int) -> Normalizer:
     """A model has a normalizer for each mesh, or one for all."""
-    return normalizers[level] if isinstance(normalizers, nn.ModuleList) else normalizers
+    normalizer = normalizers[level] if isinstance(normalizers, nn.ModuleList) else normalizers
+    assert isinstance(normalizer, Normalizer)
+    return normalizer
 
 
 class DeepMLP(nn.Module):
@@ -138,7 +147,7 @@ class DeepMLP(nn.Module):
         config: WorldEdgeConfig,
         inputs: int,
         outputs: int | None = None,
-        norm: Callable[[int], nn.Module] = nn.LayerNorm,
+        norm: Callable[[int], Norm] = nn.LayerNorm,
     ):
         super().__init__()
         hidden, width = config.hidden, outputs or config.hidden
@@ -173,6 +182,7 @@ def messages(edge_mlp: DeepMLP, edges: EdgeSet, features: Tensor, nodes: Tensor)
     of_senders, of_receivers = linear(nodes, of_sender), linear(nodes, of_receiver, edge_mlp.first.bias)
     rest, norm = edge_mlp.rest, edge_mlp.norm
     if not isinstance(rest, MLP):
+        assert norm is not None  # it does not decode
         weights = (rest.weight, rest.bias, norm.weight, norm.bias)
         return message_edges(edges, of_senders, of_receivers, linear(features, of_edge), None, *weights)
     of_nodes = of_senders.index_select(0, edges.senders) + of_receivers.index_select(0, edges.receivers)
@@ -192,7 +202,7 @@ class Decoder(nn.Module):
         self.of_elements = DeepMLP(config, config.hidden, on_elements) if on_elements else None
 
     def forward(self, nodes: Tensor, batch: Batch) -> Prediction:
-        wanted = self.of_elements is not None and batch.wants_elements
-        on_elements = self.of_elements(batch.graph.element_mean(nodes)) if wanted else None
+        of_elements = self.of_elements if batch.wants_elements else None
+        on_elements = None if of_elements is None else of_elements(batch.graph.element_mean(nodes))
         latent = Latent(nodes, batch.graph.node_offsets)
         return Prediction.of(self.data, self.of_nodes(nodes), on_elements, latent)
