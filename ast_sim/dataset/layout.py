@@ -6,7 +6,7 @@ import hashlib
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from typing import Any, Literal, get_args
 
 import h5py
 import numpy as np
@@ -39,8 +39,9 @@ FIELDS = "fields"  # the group of the named fields of a trajectory; each is an a
 FIELD_KIND = (np.float32, 3)
 NUMBERING = ("frames", "times")  # attributes of a trajectory that tell of its frames; they may be missing
 LENGTH_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254}  # in metres
-GIVEN_FRAMES = {"quasi_static": 1, "dynamic": 2}  # by integration: the first frames, from which a prediction starts
-_LOCATIONS = ("none", "node", "element")
+Integration = Literal["quasi_static", "dynamic"]
+StressLocation = Literal["none", "node", "element"]
+GIVEN_FRAMES: dict[Integration, int] = {"quasi_static": 1, "dynamic": 2}  # the first frames, where a prediction starts
 # The columns of the material in the scenes of the families that are generated here; an assembly has the third one if
 # its scenes differ in friction.
 _GENERATED = {
@@ -68,8 +69,8 @@ class DatasetInfo:
     """
 
     family: str
-    integration: str
-    stress_location: str
+    integration: Integration
+    stress_location: StressLocation
     domain_center: tuple[float, float, float]
     domain_half_width: float
     contact_radius: float
@@ -85,7 +86,7 @@ class DatasetInfo:
         """
         for key, allowed in (
             ("integration", GIVEN_FRAMES),
-            ("stress_location", _LOCATIONS),
+            ("stress_location", get_args(StressLocation)),
             ("length_unit", LENGTH_UNITS),
         ):
             if getattr(self, key) not in allowed:

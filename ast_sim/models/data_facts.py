@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
 
-from ast_sim.dataset.layout import GIVEN_FRAMES, DatasetInfo
+from ast_sim.dataset.layout import GIVEN_FRAMES, DatasetInfo, Integration, StressLocation
 from ast_sim.material import FRICTION, Material
 from ast_sim.named_field import STRESS, Output
 from ast_sim.support.toml_settings import NOTHING
@@ -32,8 +31,8 @@ class DataFacts:
             friction; 0: it recorded none, or several.
     """
 
-    integration: Literal["quasi_static", "dynamic"] = "quasi_static"
-    stress: Literal["none", "node", "element"] = "none"
+    integration: Integration = "quasi_static"
+    stress: StressLocation = "none"
     fields: tuple[tuple[str, str, int, str], ...] = ()
     columns: tuple[str, ...] = ()
     domain_center: tuple[float, float, float] = (0.0, 0.0, 0.0)

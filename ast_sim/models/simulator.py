@@ -22,6 +22,7 @@ from ast_sim.models.normalizer import Normalizer
 from ast_sim.named_field import REACTION, STRESS, Output
 from ast_sim.scene import Scene
 from ast_sim.support.errors import ConfigError
+from ast_sim.support.toml_settings import known
 
 Use = Callable[[Normalizer, Tensor], Any]  # what becomes of the values of an input: normalised, or observed
 
@@ -91,8 +92,9 @@ class Simulator(nn.Module):
         self.strain_normalizer = Normalizer("vector")
         self.stress_normalizer = Normalizer("scalar") if config.data.stress != "none" else None
         # The components of a field with several columns share one scale, like the components of a vector.
-        kinds = ("scalar" if columns == 1 else "vector" for _, _, columns, _ in config.data.fields)
-        self.field_normalizers = nn.ModuleList(map(Normalizer, kinds))
+        self.field_normalizers = nn.ModuleList(
+            Normalizer("scalar" if columns == 1 else "vector") for _, _, columns, _ in config.data.fields
+        )
         reactions = any(name == REACTION for name, *_ in config.data.fields)
         self.force_normalizer = Normalizer("vector") if reactions else None
 
@@ -155,8 +157,8 @@ class Simulator(nn.Module):
     @property
     def _outputs(self) -> Iterator[tuple[Output, Normalizer]]:
         """What is predicted beside the motion, each with its normalizer."""
-        first = () if self.stress_normalizer is None else (self.stress_normalizer,)
-        return zip(self.config.data.outputs, (*first, *self.field_normalizers), strict=True)
+        normalizers = (self.stress_normalizer, *self.field_normalizers)
+        return zip(self.config.data.outputs, (one for one in normalizers if isinstance(one, Normalizer)), strict=True)
 
     def _counting(self, output: Output, batch: Batch) -> Tensor:
         """[N or E] bool: where an output counts: at the nodes or elements that deform; of reactions at the prescribed
@@ -173,14 +175,14 @@ class Simulator(nn.Module):
         would make it wrong. So the mean of what the network says is F, and the deviations from the mean are the
         deviations of r, each with its own scale.
         """
-        if output.name != REACTION:
+        if self.force_normalizer is None or output.name != REACTION:
             return normalizer(values)
         force, count = batch.graph.body_sums(values)
         return (normalizer(values - force / count) + self.force_normalizer(force)).float()
 
     def _physical(self, output: Output, normalizer: Normalizer, said: Tensor, batch: Batch) -> Tensor:
         """The inverse of `_normalised`."""
-        if output.name != REACTION:
+        if self.force_normalizer is None or output.name != REACTION:
             return normalizer.inverse(said)
         total, count = batch.graph.body_sums(said)
         mean = total / count
@@ -197,7 +199,7 @@ class Simulator(nn.Module):
             for output, normalizer in self._outputs:
                 counting = self._counting(output, batch)
                 values = target.fields[output.name]
-                if output.name == REACTION:
+                if self.force_normalizer is not None and output.name == REACTION:
                     sums, count = batch.graph.body_sums(values)
                     self.force_normalizer.observe(sums[counting])
                     values = values - sums / count
@@ -302,7 +304,7 @@ class Simulator(nn.Module):
         if self.config.data.planar:
             motion = motion * motion.new_tensor([1, 1, 0])
         if self.config.data.dynamic:
-            return 2 * batch.position - batch.previous_position + motion
+            return 2 * batch.position - known(batch.previous_position) + motion
         return batch.position + motion
 
     def advance(self, batch: Batch, prescribed_position: Tensor) -> tuple[Tensor, Prediction]:
