@@ -290,7 +290,7 @@ typedef struct {
   /* The numbers e Q + q, ascending, of the faces whose corners no other face has: face q of element e has the corners
    * elements[e, faces[q]]; faces [Q,3]. outer has room for E Q; *num are found. */
   ast_status (*outer_faces)(const int64_t *restrict elements, int64_t E, int64_t K, const int64_t *restrict faces,
-                            int64_t Q, int64_t N, int64_t *restrict outer, int64_t *num);
+                            int64_t Q, int64_t *restrict outer, int64_t *num);
   /* out[f] = sum of x[n,f] over n, rows in blocks whose sums are added by halves: the gradient of a bias. x [N,F], out
    * [F]. */
   ast_status (*column_sum)(const float *restrict x, int64_t N, int64_t F, float *restrict out);

@@ -171,9 +171,11 @@ static ast_status mesh_faces_task(int64_t index, void *context) {
 }
 
 static ast_status outer_faces(const int64_t *restrict elements, int64_t E, int64_t K, const int64_t *restrict faces,
-                              int64_t Q, int64_t N, int64_t *restrict outer, int64_t *num) {
+                              int64_t Q, int64_t *restrict outer, int64_t *num) {
   AST_SCRATCH_SCOPE;
   const int64_t word = (int64_t)sizeof(int64_t);
+  int64_t N = 0; /* up to the last node of an element: there may be any number of others */
+  for (int64_t i = 0; i < E * K; i++) N = max64(N, elements[i] + 1);
   int64_t *lowest = ast_scratch(E * Q * word), *uppers = ast_scratch(E * Q * word), *order = ast_scratch(E * Q * word);
   int64_t *offsets = ast_scratch((N + 1) * word);
   bool *alone = ast_scratch(E * Q);

@@ -139,8 +139,7 @@ static bool mesh_edges_count(call *c, PyObject *list) {
 }
 
 KERNEL(outer_faces, num_nodes, elements, faces, outer) {
-  return chosen_kernels()->outer_faces(a->elements.data, n['E'], n['K'], a->faces.data, n['Q'], n['N'], a->outer.data,
-                                       result);
+  return chosen_kernels()->outer_faces(a->elements.data, n['E'], n['K'], a->faces.data, n['Q'], a->outer.data, result);
 }
 
 static bool outer_faces_count(call *c, PyObject *list) {

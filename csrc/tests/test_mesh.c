@@ -51,7 +51,7 @@ static void corners_of(const mesh *m, int64_t number, int64_t corners[3]) {
 
 static void check_faces(const ast_kernels *kernels, const mesh *m) {
   int64_t *outer = new_ints(m->E * m->Q), num = 0, place = 0;
-  CHECK(kernels->outer_faces(m->elements, m->E, m->K, m->faces, m->Q, m->N, outer, &num) == AST_OK, "status");
+  CHECK(kernels->outer_faces(m->elements, m->E, m->K, m->faces, m->Q, outer, &num) == AST_OK, "status");
   for (int64_t i = 0; i < m->E * m->Q; i++) {
     int64_t mine[3], others[3], like = 0;
     corners_of(m, i, mine);

@@ -356,7 +356,7 @@ static outcome outer_faces(const ast_kernels *kernels) {
   int64_t *elements = new_ints(4 * s.E), *outer = new_ints(4 * s.E), num = 0;
   for (int64_t i = 0; i < 4 * s.E; i++) elements[i] = i % 4 ? s.elements[i] : 0;
   const int64_t faces[] = {0, 2, 1, 0, 1, 3, 0, 3, 2, 1, 2, 3};
-  const ast_status status = KERNEL(kernels->outer_faces(elements, s.E, 4, faces, 4, s.N, outer, &num));
+  const ast_status status = KERNEL(kernels->outer_faces(elements, s.E, 4, faces, 4, outer, &num));
   for (int64_t i = num; i < 4 * s.E; i++) outer[i] = -1;
   return FINISH(status, outer);
 }

@@ -36,6 +36,8 @@ def test_two_tetrahedra_by_hand():
     assert edges.receiver_offsets.tolist() == [0, 3, 7, 11, 15, 15, 18] and edges.num_senders == 6
     # Of the first all but the face 1 2 3, which is its last one; of the second all but its first one.
     assert outer_faces(elements, 6).tolist() == [0, 1, 2, 5, 6, 7]
+    # Nodes of no element cost nothing, however many there are.
+    assert outer_faces(elements, 2**40).tolist() == [0, 1, 2, 5, 6, 7]
 
 
 def test_pairs_are_edges():
