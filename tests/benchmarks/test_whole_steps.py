@@ -2,12 +2,15 @@
 
 import json
 import math
+from types import SimpleNamespace
 
 import pytest
 
 from ast_sim.simulate.jobs.generate import generate
+from ast_sim.support.precisions import PRECISIONS
 from benchmarks.steps import __main__ as steps
 from benchmarks.steps import newton_worker, scenes, whole_steps
+from benchmarks.steps.training_step import Worker
 from benchmarks.steps.whole_steps import Place, Record
 
 
@@ -41,11 +44,27 @@ def test_a_step_is_timed_on_one_thread_and_on_two_and_in_both_precisions(tmp_pat
     generate("deforming_plate", data, train=2, valid=0, test=1, nodes=100, frames=3, progress=False)
     case = scenes.Case("tiny", ["train.batch_size=2"], data, 200, "", "", steps=1, most_repeats=2, every_thread=False)
     monkeypatch.setattr(whole_steps.scenes, "make", lambda *_: case)
+    begun = {}  # all presets are one case here, so they share their processes
+
+    def worker(backend, threads, setup, log):
+        kind = (backend, threads, *setup.settings)
+        begun[kind] = begun.get(kind) or Worker(backend, threads, setup, log)
+        return SimpleNamespace(ask=begun[kind].ask, close=lambda: None)
+
+    monkeypatch.setattr(whole_steps, "Worker", worker)
     place = Place(tmp_path, tmp_path, 3)
     for measure, targets in ((whole_steps.threads, [1.6, 1.7, 0.97]), (whole_steps.precision, [1.3, 1, 1, 1])):
         records = list(measure(place))
         assert [record.least for record in records] == targets
         assert all(math.isfinite(record.value) and record.value > 0 for record in records)
+    for process in begun.values():
+        process.close()
+    batch = "train.batch_size=2"
+    assert set(begun) == {
+        ("c", 1, batch),
+        ("c", 2, batch),
+        *(("c", 1, batch, f"train.precision={kind}") for kind in PRECISIONS),
+    }
 
 
 def test_a_batch_is_timed_beside_one_scene(tmp_path, monkeypatch):
