@@ -15,6 +15,7 @@ import toy
 from safetensors.torch import load_file
 
 import ast_sim
+from ast_sim.cli import main
 from ast_sim.dataset.reader import Dataset
 from ast_sim.runs import checkpoint
 from ast_sim.runs.folder import RunFolder
@@ -39,8 +40,8 @@ def words_of(data: Path, run: Path, steps: int, *words: str) -> tuple[str, ...]:
     return (str(data), "--out", str(run), *settings, *words)
 
 
-def train(processes: int, data: Path, run: Path, steps: int, *words: str, check: bool = True):
-    words = words_of(data, run, steps, "--processes", str(processes), *words)
+def train_two(data: Path, run: Path, steps: int, *words: str, check: bool = True):
+    words = words_of(data, run, steps, "--processes", "2", *words)
     return subprocess.run(command(1, *words), capture_output=True, text=True, check=check, timeout=300)
 
 
@@ -63,8 +64,8 @@ def data(tmp_path_factory) -> Path:
     ids=["pairs", "rollouts", "jumps"],
 )
 def test_two_processes_do_what_one_does(data, tmp_path, along):
-    told = train(2, data, tmp_path / "two", 8, *along).stdout
-    train(1, data, tmp_path / "one", 8, *along)
+    told = train_two(data, tmp_path / "two", 8, *along).stdout
+    assert main(["train", *words_of(data, tmp_path / "one", 8, *along)]) == 0
     one, two = weights(tmp_path / "one"), weights(tmp_path / "two")
     for name, ours in one.items():
         # Sums over two parts round otherwise; Adam's steps of about the rate follow even the smallest gradients.
@@ -84,7 +85,7 @@ def test_two_processes_do_what_one_does(data, tmp_path, along):
     assert all(torch.equal(value, two[name]) for name, value in weights(tmp_path / "two").items())
 
 
-def test_torchrun_and_a_notebook_train_the_same_model(data, tmp_path, request):
+def test_torchrun_and_a_notebook_train_the_same_model(data, tmp_path, request, capsys):
     one_thread = {**os.environ, "OMP_NUM_THREADS": "1"}  # of each process: sums over threads round otherwise
     subprocess.run(command(2, *words_of(data, tmp_path / "torchrun", 8)), check=True, timeout=300, env=one_thread)
     settings = dict(setting.split("=") for setting in SETTINGS)
@@ -109,12 +110,13 @@ def test_torchrun_and_a_notebook_train_the_same_model(data, tmp_path, request):
 
     # What two began one goes on with.
     words = words_of(data, tmp_path / "torchrun", 12, "--resume", "--processes", "1")
-    refused = subprocess.run(command(1, *words), capture_output=True, text=True, timeout=300)
-    assert "was started with train.steps = 8, not 12" in refused.stderr  # only the number of processes may differ
+    assert main(["train", *words]) == 2
+    assert (
+        "was started with train.steps = 8, not 12" in capsys.readouterr().err
+    )  # only the number of processes may differ
     shutil.rmtree(tmp_path / "torchrun/checkpoints/step-8")
     words = words_of(data, tmp_path / "torchrun", 8, "--resume", "--processes", "1")
-    done = subprocess.run(command(1, *words), capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0 and "going on after step 4" in done.stdout, done.stderr
+    assert main(["train", *words]) == 0 and "going on after step 4" in capsys.readouterr().out
 
 
 def test_the_usual_number_follows_from_the_size_of_a_step(data, monkeypatch):
@@ -156,7 +158,7 @@ def test_a_process_that_is_killed_ends_the_training_with_its_cause(data, tmp_pat
 
 
 def test_a_batch_that_cannot_be_cut_is_refused(data, tmp_path):
-    done = train(2, data, tmp_path / "run", 4, "--set", "train.batch_size=3", check=False)
+    done = train_two(data, tmp_path / "run", 4, "--set", "train.batch_size=3", check=False)
     assert done.returncode != 0 and "train.batch_size = 3 cannot be cut for 2 processes" in done.stderr
     assert not (tmp_path / "run/config.toml").exists()  # else the corrected command would be refused, too
 

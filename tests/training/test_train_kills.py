@@ -1,5 +1,6 @@
 """Real processes, really killed: resuming ends in the bits of a training that nothing disturbed."""
 
+import functools
 import hashlib
 import os
 import random
@@ -121,18 +122,19 @@ def test_a_run_that_starts_from_another_one_is_killed_and_resumes_to_the_same_bi
     assert outcome(run) == outcome(tmp_path / "whole")
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
-def test_signals_finish_the_step_write_a_checkpoint_and_exit(undisturbed, tmp_path, number, code):
+def test_signals_finish_the_step_write_a_checkpoint_and_exit(undisturbed, tmp_path):
     data, expected = undisturbed
-    run = tmp_path / "run"
-    heed = lambda: signal.signal(number, signal.SIG_DFL)  # noqa: E731 (the tests themselves may run under nohup)
-    process = start(data, "--out", run, settings=SMALL, preexec_fn=heed)
-    wait_for_progress(process, run, -1)
-    process.send_signal(number)
-    out, error = finish(process, code)
-    assert f"stopped after step {newest(run)}: go on with resume=True (--resume)" in out
-    assert "Traceback" not in error
-    assert 0 < newest(run) < STEPS
+    run, reached = tmp_path / "run", -1
+    for number, code in ((signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)):
+        heed = functools.partial(signal.signal, number, signal.SIG_DFL)  # the tests themselves may run under nohup
+        process = start(data, "--out", run, "--resume", settings=SMALL, preexec_fn=heed)
+        wait_for_progress(process, run, reached)
+        process.send_signal(number)
+        out, error = finish(process, code)
+        assert f"stopped after step {newest(run)}: go on with resume=True (--resume)" in out
+        assert "Traceback" not in error
+        assert reached < newest(run) < STEPS
+        reached = newest(run)
     finish(start("--out", run, "--resume"))
     assert outcome(run) == expected
 
