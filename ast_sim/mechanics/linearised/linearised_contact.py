@@ -44,6 +44,7 @@ OVERLAP = 1e-6  # pairs may overlap by this much at the end of a step, in mean e
 FEW = 16  # a round takes at least this number of the pairs that would overlap,
 SHARE = 4  # or this part of them,
 MORE = 16  # or this part of all that were taken before, if that is more
+YIELDING = 1e-6  # contact yields by this share of what the bodies do, so that pairs that say the same share a force
 ROUNDED = 1e-12  # an overlap of this part of the deepest is rounding
 PATIENCE, MOST_PIVOTS = 3, 30  # turns of all wrong pairs without fewer of them; turns in all, for each pair
 SWEEPS, CHANGE = 100, 1e-3  # forces of friction are found when a sweep over the pairs changes them by less
@@ -206,7 +207,9 @@ class NewtonSteps:
 def _pressed(compliance: np.ndarray, offset: np.ndarray) -> np.ndarray:
     """The forces l >= 0 [P] of contact without friction, which minimise 1/2 l B l + b l, by block principal pivoting
     (Kim and Park 2011): pairs that pull let go, pairs that overlap press, all at once. Where this does not leave fewer
-    and fewer wrong pairs, one pair at a time, the last: this ends (Murty 1974)."""
+    and fewer wrong pairs, one pair at a time, the last: this ends (Murty 1974). Where a fine tool presses on a coarse
+    part, far more pairs than degrees of freedom touch; without `YIELDING`, B would be singular."""
+    compliance = compliance + YIELDING * compliance.diagonal().mean() * np.eye(len(compliance))
     pressing = offset < 0
     slack = ROUNDED * np.abs(offset).max()
     fewest, patience = len(offset) + 1, PATIENCE
