@@ -13,6 +13,7 @@ from ast_sim.importers.decks.deck_numbers import real, refuse_decimal_commas, to
 from ast_sim.importers.decks.keyword_lines import Keyword, Line
 from ast_sim.importers.formats.source_mesh import SourceMesh
 from ast_sim.importers.solved_jobs.job_materials import MATERIAL_KEYWORDS, material_columns
+from ast_sim.importers.solved_jobs.job_temperatures import rows_of_target
 from ast_sim.number_arrays import connected_parts
 from ast_sim.scene import NodeType
 from ast_sim.support.errors import DatasetError
@@ -105,7 +106,7 @@ def read_job(path: Path) -> Job:
     _require_plain_results(deck)
     mesh = mesh_of_deck(deck, _READ)
     conditions = _conditions(deck, mesh)
-    materials, more = material_columns(deck)
+    materials, more = material_columns(deck, mesh)
     mesh.notes.extend([*conditions.notes, *more, *_not_in_a_scene(deck)])
     starts_with = [_initial(keyword) for keyword in deck.keywords if keyword.name == "INITIALCONDITIONS"]
     if "VELOCITY" in starts_with:
@@ -150,7 +151,6 @@ def _conditions(deck: Deck, mesh: SourceMesh) -> _Conditions:
     free = np.zeros(shape, bool)
     moved, turned, rigid = (free[:, 0].copy() for _ in range(3))
     state = _Conditions(free.copy(), free.copy(), np.ones(shape, bool), moved, turned, rigid)
-    groups = {name.upper(): nodes for name, nodes in mesh.groups.items()}
     renewed = False
     for keyword in deck.keywords:
         if keyword.name == "BOUNDARY":
@@ -158,27 +158,25 @@ def _conditions(deck: Deck, mesh: SourceMesh) -> _Conditions:
                 state.now[:] = False
                 renewed = True
             for line in keyword.data:
-                _prescribe(keyword, line, state, mesh, groups)
+                _prescribe(keyword, line, state, mesh)
         elif keyword.name == "STEP":
             renewed = False
         elif keyword.name == "ENDSTEP":
             state.end_step()
     for keyword in deck.keywords:
         if keyword.name == "RIGIDBODY":
-            _rigid_body(keyword, state, mesh, groups)
+            _rigid_body(keyword, state, mesh)
     partly = (state.sometimes & ~state.always)[:, :3].any(axis=1)
     if partly.any():
         state.notes.append(f"{partly.sum()} nodes are prescribed in some steps only: they count as prescribed in all")
     return state
 
 
-def _prescribe(
-    keyword: Keyword, line: Line, state: _Conditions, mesh: SourceMesh, groups: dict[str, np.ndarray]
-) -> None:
+def _prescribe(keyword: Keyword, line: Line, state: _Conditions, mesh: SourceMesh) -> None:
     """A data line of *BOUNDARY: `node or set, first direction, last direction, value`, or `node or set, ENCASTRE`."""
     refuse_decimal_commas(line, 4, "a target, two directions and a value")
     target, first, last, value = [*tokens(line), "", "", "", ""][:4]
-    rows = _rows(keyword, target, mesh, groups)
+    rows = rows_of_target(keyword, target, mesh)
     if first.upper() in _NAMED:
         state.now[np.ix_(rows, np.array(_NAMED[first.upper()]) - 1)] = True
         return
@@ -192,26 +190,16 @@ def _prescribe(
         (state.moved if lowest <= 3 else state.turned)[rows] = True
 
 
-def _rows(keyword: Keyword, target: str, mesh: SourceMesh, groups: dict[str, np.ndarray]) -> np.ndarray:
-    """The points of a node or of a set of nodes."""
-    if target.isdigit():
-        assert mesh.same_point is not None
-        return np.flatnonzero(mesh.same_point == int(target))
-    if target.upper() not in groups:
-        raise keyword.error(f"there is no set of nodes {target!r}")
-    return groups[target.upper()]
-
-
-def _rigid_body(keyword: Keyword, state: _Conditions, mesh: SourceMesh, groups: dict[str, np.ndarray]) -> None:
+def _rigid_body(keyword: Keyword, state: _Conditions, mesh: SourceMesh) -> None:
     """The nodes of a *RIGID BODY are prescribed as its reference node is; in CalculiX a second node has the turns."""
     name = next((keyword.options[key] for key in ("NSET", "ELSET", "TIENSET", "PINNSET") if key in keyword.options), "")
-    nodes = _rows(keyword, name, mesh, groups)
+    nodes = rows_of_target(keyword, name, mesh)
     reference = keyword.required("REFNODE")
-    at = _rows(keyword, reference, mesh, groups)
+    at = rows_of_target(keyword, reference, mesh)
     turns = state.sometimes[at, 3:].any(axis=0)
     is_turned = state.turned[at].any()
     if "ROTNODE" in keyword.options:
-        turning = _rows(keyword, keyword.options["ROTNODE"], mesh, groups)
+        turning = rows_of_target(keyword, keyword.options["ROTNODE"], mesh)
         turns |= state.sometimes[turning, :3].any(axis=0)
         is_turned |= state.moved[turning].any()
     shifts = state.sometimes[at, :3].any(axis=0)
