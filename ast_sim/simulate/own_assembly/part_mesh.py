@@ -191,6 +191,8 @@ def _from_file(part: PartSpec, request: dict[str, Any]) -> PartMesh:
     used, elements = np.unique(mesh.elements, return_inverse=True)
     elements = elements.reshape(-1, mesh.elements.shape[1])
     position = request["scale"] * mesh.points[used]
+    told = ("; ".join(mesh.notes),) if mesh.notes else ()
+    notes = tuple(f"{request['name']}: {note}" for note in told)
     fields = {
         n: np.asarray(v)[used] for n, v in mesh.fields["point"].items() if np.ndim(v) == 1 and v.dtype.kind in "iufb"
     }
@@ -198,8 +200,9 @@ def _from_file(part: PartSpec, request: dict[str, Any]) -> PartMesh:
     if elements.shape[1] == 3:
         if not np.isfinite(position).all():
             raise BadMesh(f"{request['name']}: a corner is not finite")
-        return _surface_mesh(part, request, whole_surface(mesh.points[used][elements]))
-    mesh = PartMesh(request["name"], position, elements, groups, fields)
+        surface = whole_surface(mesh.points[used][elements])
+        return _surface_mesh(part, request, replace(surface, notes=(*told, *surface.notes)))
+    mesh = PartMesh(request["name"], position, elements, groups, fields, notes)
     mesh = _raised(mesh) if request["order"] == 2 and elements.shape[1] == 4 else mesh
     return _checked(_halved(mesh) if request["halved"] else mesh, part.rigid)
 

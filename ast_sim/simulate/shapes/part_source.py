@@ -17,7 +17,7 @@ from ast_sim.simulate.shapes.cad import gmsh_process, grammar
 from ast_sim.simulate.shapes.cad.surface_mend import stl_surface
 from ast_sim.simulate.shapes.mesh_check import SMALLEST_ANGLE, BadMesh, check_mesh, check_surface
 from ast_sim.simulate.shapes.parts import Part, draw_structured
-from ast_sim.support.errors import ConfigError, DatasetError, MissingExtra
+from ast_sim.support.errors import ConfigError, DatasetError, MissingExtra, warn
 
 STEP_ENDINGS = (".step", ".stp")
 STL_ENDING = ".stl"
@@ -50,7 +50,7 @@ class PartSource(Protocol):
         ...
 
     def check(self) -> None:
-        """Raise SimulationError if a part that may be drawn is broken."""
+        """Raise SimulationError if a part that may be drawn is broken; warnings tell what was not taken as it is."""
 
     def draw(self, rng: np.random.Generator) -> Mesher:
         """Two parts, ready to be meshed."""
@@ -130,6 +130,9 @@ class FileParts:
         for path in self.files:
             (part,) = _load([path], TRIAL_NODES)
             check_mesh(part.position, part.elements, path.name)
+            notes = stl_surface(path).notes if path.suffix.lower() == STL_ENDING else part.notes
+            if notes:
+                warn(f"{path.name}: {'; '.join(notes)}")
 
     def draw(self, rng: np.random.Generator) -> Mesher:
         count = len(self.files)
@@ -221,4 +224,4 @@ def meshed_part(path: Path) -> Part:
     position = mesh.points[used]
     elements = elements.reshape(-1, 4)
     check_mesh(position, elements, path.name)
-    return Part(position / np.linalg.norm(np.ptp(position, axis=0)), elements, path.name)
+    return Part(position / np.linalg.norm(np.ptp(position, axis=0)), elements, path.name, tuple(mesh.notes))

@@ -25,11 +25,13 @@ class Part:
         position: [N,3] float64.
         elements: [E,4] int64, tetrahedra of positive volume.
         name: what it is: a shape of the grammar, or the name of a file.
+        notes: what a user should know of the file, a sentence each.
     """
 
     position: np.ndarray
     elements: np.ndarray
     name: str
+    notes: tuple[str, ...] = ()
 
 
 def volumes(position: np.ndarray, elements: np.ndarray) -> np.ndarray:

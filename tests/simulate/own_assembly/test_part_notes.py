@@ -1,0 +1,69 @@
+"""What is not taken as it stands in the file of a part is told before anything is solved, and kept with the scenes."""
+
+import meshio
+import numpy as np
+import pytest
+from simulate.own_assembly.assemblies import box, write_assembly
+
+from ast_sim import Dataset, cli
+from ast_sim.element_topology import surface_triangles
+from ast_sim.simulate.own_assembly.parameters import completed
+from ast_sim.simulate.own_assembly.part_mesh import part_meshes
+from ast_sim.simulate.own_assembly.spec_reader import read_spec
+from ast_sim.simulate.shapes.part_source import part_source
+
+BLOCK = "block (block.vtu): "
+
+
+def write_odd(path, kind):
+    """The block with something that is mended or left out, and what is said of it."""
+    position, elements = box((0, 0, 0), (10, 10, 5), (4, 4, 2))
+    cells, count = [("tetra", elements)], len(elements)
+    if kind == "turned":
+        cells, told = [("tetra", elements[:, [0, 2, 1, 3]])], f"{count} tetrahedra that were inside out are turned over"
+    elif kind == "twice":
+        cells, told = [("tetra", np.concatenate([elements, elements[:5]]))], "5 elements that stand in the file twice"
+    elif kind == "hexahedra":
+        corners = np.array([(x, y, z) for z in (0, 5) for x, y in ((0, 0), (10, 0), (10, 10), (0, 10))], float)
+        position, cells = corners, [("hexahedron", np.arange(8)[None])]
+        told = "1 cells of the kind hexahedron are cut into"
+    else:
+        cells.append(("triangle", np.array([elements[0, :3]])))
+        position = np.concatenate([position, [[5.0, 5, 9]]])
+        told = "1 cells of the kind triangle are left out; 1 points of no element are left out"
+    meshio.Mesh(position, cells).write(path)
+    return told
+
+
+@pytest.mark.parametrize("kind", ["turned", "twice", "hexahedra", "left out"])
+def test_the_notes_of_a_mesh_are_the_notes_of_its_part(tmp_path, kind):
+    spec = read_spec(write_assembly(tmp_path))
+    told = write_odd(tmp_path / "block.vtu", kind)
+    block, punch = part_meshes(spec, completed(spec.parameters, {}))
+    (note,) = block.notes
+    assert note.startswith(BLOCK) and told in note
+    assert not punch.notes
+
+
+def test_generate_tells_them_and_keeps_them_with_the_scenes(tmp_path, capsys):
+    path = write_assembly(tmp_path)
+    told = write_odd(tmp_path / "block.vtu", "turned")
+    out = tmp_path / "d.h5"
+    assert cli.main(["generate", "assembly", str(path), "--out", str(out), "--count", "1", "--workers", "1"]) == 0
+    assert BLOCK + told in "".join(capsys.readouterr())
+    with Dataset(out) as data:
+        assert BLOCK + told in data["train"][0].attributes["notes"]
+
+
+@pytest.mark.parametrize("ending", ["vtu", "stl"])
+def test_the_parts_of_pairs_are_told_as_well(tmp_path, ending):
+    path = tmp_path / f"part.{ending}"
+    told = write_odd(tmp_path / "part.vtu", "left out")
+    if ending == "stl":
+        pytest.importorskip("gmsh")
+        corners, cells = box((0, 0, 0), (1, 1, 1), (1, 1, 1))
+        triangles = np.concatenate([surface_triangles(corners, cells), [[0, 1, 1]]])
+        meshio.Mesh(corners, [("triangle", triangles)]).write(path)
+        told = "area"
+    with pytest.warns(UserWarning, match=f"^part.{ending}: .*{told}"):
+        part_source(path).check()
