@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import re
-import tempfile
-import xml.etree.ElementTree as ET
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -17,10 +12,11 @@ from ast_sim.element_topology import is_closed
 from ast_sim.importers.decks.deck_mesh import deck_mesh
 from ast_sim.importers.formats.gmsh_fields import has_steps
 from ast_sim.importers.formats.gmsh_files import gmsh_frames
-from ast_sim.importers.formats.source_mesh import CellBlock, SourceMesh, from_meshio
+from ast_sim.importers.formats.source_mesh import CellBlock, SourceMesh
 from ast_sim.importers.formats.stl_file import BadSurface, read_stl
 from ast_sim.importers.formats.vtk_files import BLOCKS, ENDINGS, is_dyna, vtk_frames
-from ast_sim.importers.meshio_files import BY_MESHIO, by_meshio, what_meshio_says
+from ast_sim.importers.meshio_files import BY_MESHIO, by_meshio
+from ast_sim.importers.xdmf.xdmf_frames import xdmf_frames
 from ast_sim.support.errors import DatasetError
 
 # Formats whose files hold all frames of a simulation.
@@ -79,7 +75,7 @@ def frames_in(path: Path) -> Iterator[SourceMesh]:
     elif ending == ".stl":
         yield _surface(path)
     elif ending in XDMF:
-        yield from _xdmf_frames(path)
+        yield from xdmf_frames(path)
     else:
         yield by_meshio(path)
 
@@ -101,187 +97,3 @@ def _surface(path: Path) -> SourceMesh:
     if all(is_closed(nodes.reshape(-1, 3)[stl.solid == solid]) for solid in np.unique(stl.solid)):
         points, nodes = np.unique(np.column_stack([rows, np.repeat(stl.solid, 3)]), axis=0, return_inverse=True)
     return SourceMesh(path, points[:, :3], [CellBlock("triangle", nodes.reshape(-1, 3), "triangle")])
-
-
-def _xdmf_frames(path: Path) -> Iterator[SourceMesh]:
-    """The frames of a series; a file without a series is one frame. Frames that have a geometry or cells of their own
-    keep them; meshio's reader of series takes the points and cells of the first."""
-    import meshio
-
-    try:
-        tree = ET.parse(path)
-    except (ET.ParseError, OSError, ValueError, LookupError) as error:
-        raise DatasetError(f"{path}: cannot be read as a mesh: it is no XML: {error}") from error
-    _require_understood(path, tree)
-    series = tree.findall("Domain/Grid[@GridType='Collection']")
-    version = str(tree.getroot().get("Version"))
-    if series and version.partition(".")[0] != "3":
-        raise DatasetError(
-            f"{path}: is XDMF of the version {version}; write a series of version 3 (Xdmf3 in ParaView), .vtkhdf or"
-            " .pvd"
-        )
-    named = ", ".join(dict.fromkeys(one.get("Name", "without a name") for one in tree.iter("Set")))
-    sets = [f"sets are not read: {named}"] if named else []
-    time, timed = (None, False) if series else _without_time(path, tree)
-    if series:
-        _require_plain(path, series)
-        _require_no_other(path, tree, series[0])
-    changes = [_with_defaults(tree), _with_references(path, tree), timed]
-    with _beside(path, tree, any(changes)) as copy:
-        if not series:
-            mesh = by_meshio(path, copy)
-            _require_count(mesh, tree.find(".//Topology"))
-            yield replace(mesh, time=time, notes=[*mesh.notes, *sets])
-            return
-        try:
-            with meshio.xdmf.TimeSeriesReader(copy) as reader:
-                shared = reader.read_points_cells()
-                for step, grid in enumerate(reader.collection):
-                    points, cells = _own_mesh(reader, grid, shared)
-                    reader.cells = cells
-                    time, point_data, cell_data = reader.read_data(step)
-                    values: Any = cell_data
-                    frame = meshio.Mesh(np.asarray(points), cells, point_data, values)
-                    mesh = from_meshio(frame, path)
-                    topology = grid.find("Topology")
-                    _require_count(mesh, tree.find(".//Topology") if topology is None else topology)
-                    yield replace(mesh, time=float(time), notes=[*mesh.notes, *sets])
-        except DatasetError:
-            raise
-        except (Exception, SystemExit) as error:
-            raise DatasetError(f"{path}: cannot be read as a mesh: {what_meshio_says(error)}") from error
-
-
-def _require_count(mesh: SourceMesh, topology: ET.Element | None) -> None:
-    """Raise DatasetError if a topology says another number of cells than its array has."""
-    said = "" if topology is None else topology.get("NumberOfElements", topology.get("Dimensions", ""))
-    cells = sum(len(block.nodes) for block in mesh.blocks)
-    if said.isdigit() and int(said) != cells:
-        raise DatasetError(f"{mesh.path}: says that it holds {said} cells, but their array has {cells}")
-
-
-def _without_time(path: Path, tree: ET.ElementTree[Any]) -> tuple[float | None, bool]:
-    """Take the time out of the grid of a file without a series: meshio refuses it. What it says, and whether there was
-    one."""
-    said = [(grid, time) for grid in tree.iter("Grid") for time in grid.findall("Time")]
-    for grid, time in said:
-        grid.remove(time)
-    try:
-        return (float(said[0][1].attrib["Value"]) if said else None), bool(said)
-    except (KeyError, ValueError) as error:
-        raise DatasetError(f"{path}: the Time of its grid has no Value that is a number") from error
-
-
-def _with_defaults(tree: ET.ElementTree[Any]) -> bool:
-    """Write out what XDMF takes where nothing is said, and meshio needs: uniform grids, fields of nodes. Whether there
-    is such a place."""
-    defaults = [("Grid", "GridType", "Uniform"), ("Attribute", "Center", "Node")]
-    silent = [(one, key, value) for tag, key, value in defaults for one in tree.iter(tag) if one.get(key) is None]
-    for one, key, value in silent:
-        one.set(key, value)
-    return bool(silent)
-
-
-def _with_references(path: Path, tree: ET.ElementTree[Any]) -> bool:
-    """Put what is referred to in the place of each reference; meshio knows them within numbers alone. Whether there is
-    one."""
-    places = [(parent, row) for parent in tree.iter() for row, one in enumerate(parent) if one.get("Reference")]
-    targets = [_referred(path, tree, parent[row]) for parent, row in places]
-    for (parent, row), target in zip(places, targets, strict=True):
-        parent[row] = target
-    return bool(places)
-
-
-def _referred(path: Path, tree: ET.ElementTree[Any], item: ET.Element) -> ET.Element:
-    """What an item refers to, which must not refer to something itself."""
-    named = item.get("Reference", "")
-    named = (item.text or "" if named == "XML" else named).strip()
-    target = None
-    with contextlib.suppress(SyntaxError, KeyError, TypeError):  # no path as ElementTree knows them
-        target = tree.getroot().find("." + (named if named.startswith("//") else named.removeprefix("/Xdmf")))
-    if target is None or target.tag != item.tag or any(one.get("Reference") for one in target.iter()):
-        raise DatasetError(f"{path}: refers to {named!r}, which it does not hold: write it out")
-    return target
-
-
-def _own_mesh(reader: Any, grid: ET.Element, shared: tuple[Any, Any]) -> tuple[Any, Any]:
-    """The points and cells of a grid; of the first grid where it has none of its own."""
-    if grid.find("Geometry") is None and grid.find("Topology") is None:
-        return shared
-    reader.mesh_grid = grid
-    points, cells = reader.read_points_cells()
-    return shared[0] if points is None else points, cells or shared[1]
-
-
-def _require_understood(path: Path, tree: ET.ElementTree[Any]) -> None:
-    """Raise DatasetError if nodes are not counted from 0 or stand in an order of their own, numbers are not plain ones,
-    or a grid has a field twice: meshio reads over it."""
-    for item in tree.iter("DataItem"):
-        if item.get("ItemType", "Uniform") != "Uniform":
-            raise DatasetError(f"{path}: has numbers of the type {item.get('ItemType')}; must be plain ones (Uniform)")
-    for attribute in tree.iter("Attribute"):
-        center = attribute.get("Center", "Node")
-        if center not in ("Node", "Cell"):
-            raise DatasetError(
-                f"{path}: the field {attribute.get('Name')!r} has its values at the place {center!r}: write them at the"
-                " nodes or in the cells (in FEniCS by write, not by write_checkpoint)"
-            )
-    for topology in tree.iter("Topology"):
-        if topology.get("BaseOffset", "0").strip() not in ("", "0"):
-            raise DatasetError(
-                f"{path}: counts its nodes from {topology.get('BaseOffset')} (BaseOffset); must be from 0"
-            )
-        if topology.get("Order"):
-            raise DatasetError(f"{path}: its cells have an Order of nodes; must be the one of XDMF, without an Order")
-    for grid in tree.iter("Grid"):
-        fields = [(one.get("Name"), one.get("Center", "Node")) for one in grid.findall("Attribute")]
-        twice = next((name for name, center in fields if fields.count((name, center)) > 1), None)
-        if twice is not None:
-            raise DatasetError(f"{path}: a grid has the field {twice!r} twice")
-
-
-def _require_no_other(path: Path, tree: ET.ElementTree[Any], series: ET.Element) -> None:
-    """Raise DatasetError if a grid stands beside a series that does not refer to it, or several do."""
-    beside = [grid for grid in tree.findall("Domain/Grid") if grid is not series]
-    refers = any(item.tag.endswith("include") or item.get("Reference") for item in series.iter())
-    if len(beside) > 1 or (beside and not refers):
-        raise DatasetError(f"{path}: holds a grid beside the series of frames: write all bodies into one grid")
-
-
-def _require_plain(path: Path, series: list[ET.Element]) -> None:
-    """Raise DatasetError unless there is one series over time, and each of its frames is one grid with its time."""
-    if len(series) > 1:
-        raise DatasetError(
-            f"{path}: holds {len(series)} series of frames, and one can be read: write all bodies and fields into one"
-        )
-    kind = series[0].get("CollectionType")
-    if kind != "Temporal":
-        raise DatasetError(
-            f"{path}: holds a collection of the type {kind!r}; must be 'Temporal', a grid for each frame"
-        )
-    for number, grid in enumerate(series[0]):
-        if grid.tag != "Grid" or grid.get("GridType") == "Collection" or grid.find("Time[@Value]") is None:
-            raise DatasetError(f"{path}: entry {number} of the series is no single grid with a Time of its own")
-
-
-@contextlib.contextmanager
-def _beside(path: Path, tree: ET.ElementTree[Any], changed: bool) -> Iterator[Path]:
-    """An XDMF file; or a copy, if its tree was changed, or if numbers stand in binary files beside it, which meshio
-    looks for in the folder in which the process runs: the copy names them in full."""
-    binary = [item for item in tree.iter("DataItem") if item.get("Format") == "Binary" and item.text]
-    for item in binary:
-        if item.get("Endian") == "Big" or item.get("Seek", "0") != "0" or item.get("Compression", "Raw") != "Raw":
-            raise DatasetError(
-                f"{path}: its binary numbers must be plain ones of this machine, from the start of a file"
-            )
-        item.text = str(path.parent.resolve() / str(item.text).strip())
-    if not binary and not changed:
-        yield path
-        return
-    with tempfile.TemporaryDirectory() as folder:
-        copy = Path(folder) / path.name
-        for item in tree.iter("DataItem"):
-            if item.get("Format") == "HDF" and item.text:
-                item.text = str(path.parent.resolve() / item.text.strip())
-        tree.write(copy)
-        yield copy

@@ -24,7 +24,13 @@ from ast_sim.importers.solids.frames_match import in_order_of, order_of_cells
 from ast_sim.importers.solids.kept_fields import KeptFields
 from ast_sim.importers.solids.kept_frames import KeptFrames
 from ast_sim.importers.solids.mesh_elements import require_extent
-from ast_sim.importers.solids.positions import far_origin, rest_and_position, warn_of_rounding, with_layers
+from ast_sim.importers.solids.positions import (
+    far_origin,
+    fields_of_components,
+    rest_and_position,
+    warn_of_rounding,
+    with_layers,
+)
 from ast_sim.importers.solids.stitching import Stitching
 from ast_sim.importers.solved_jobs.job import Job, read_job
 from ast_sim.importers.solved_jobs.job_results import job_frames
@@ -42,8 +48,9 @@ class FieldNames:
     """The names of the fields in the files. A field that is named here must be present.
 
     Attributes:
-        displacement: point field, the displacement from rest. None: "displacement" if it is present; else the points
-            themselves move, and the first frame is at rest.
+        displacement: point field, the displacement from rest, or what the names of fields of one component each have
+            in common, "U" of U1, U2 and U3. None: "displacement" if it is present; else the points themselves move, and
+            the first frame is at rest.
         stress: point or cell field: the von Mises stress, or the components of a stress tensor; or what the names of
             fields of one component each have in common, "S" of S11, S22, .... None: "von_mises" if it is present.
         node_type: point field with the numbers of `NodeType`. None: "node_type" if it is present; else all nodes are
@@ -246,9 +253,11 @@ def frames(source: Path) -> Iterator[SourceMesh]:
 
 def _displacement(frame: SourceMesh, names: FieldNames) -> np.ndarray | None:
     """The displacements of the points [n, 3]; None if the file holds none."""
-    if names.displacement is None and "displacement" not in frame.point_fields:
+    name = names.displacement or "displacement"
+    parts = [] if name in frame.point_fields else fields_of_components(name, frame.point_fields)
+    if names.displacement is None and name not in frame.point_fields and not parts:
         return None
-    value = raw_field(frame, "point", names.displacement or "displacement")
+    value = np.concatenate([raw_field(frame, "point", one) for one in parts or [name]], axis=1)
     if value.shape[1] not in (2, 3):
         raise DatasetError(f"{frame.path}: the displacement has {value.shape[1]} components; must have 2 or 3")
     if value.shape[1] == 2 and any(block.dimension == 3 for block in frame.blocks):

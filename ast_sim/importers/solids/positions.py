@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +19,22 @@ _POSITIONS = 0.25
 
 # Rounding to float32 may change the displacements by this share of the largest one before a warning is given.
 _ROUNDING = 0.01
+
+
+# What a name ends with that is a component along an axis: U1, UX, displacement_x.
+_COMPONENT = re.compile(r"(.*?)[ _.:(\[-]*([xyz123])[)\]]?", re.IGNORECASE)
+
+
+def fields_of_components(name: str, fields: Iterable[str]) -> list[str]:
+    """The fields of the components along x, y and, if there is one, z of a vector that is no field itself: U1, U2 and
+    U3 of U. None if x or y is missing, or a component stands twice."""
+    axes: dict[str, list[str]] = {}
+    for field in fields:
+        match = _COMPONENT.fullmatch(field.strip())
+        if match and match[1].casefold() == name.casefold():
+            axes.setdefault("xyz"["xyz123".index(match[2].lower()) % 3], []).append(field)
+    once = sorted(axes) in ([*"xy"], [*"xyz"]) and all(len(held) == 1 for held in axes.values())
+    return [axes[axis][0] for axis in sorted(axes)] if once else []
 
 
 def rest_and_position(
