@@ -28,6 +28,7 @@ from ast_sim.importers.solids.positions import (
     far_origin,
     fields_of_components,
     rest_and_position,
+    told_of_components,
     warn_of_rounding,
     with_layers,
 )
@@ -221,7 +222,7 @@ def _read_frames(
             )
     assert first is not None and stitching is not None
     files, times, _, said = frame_files(source)
-    notes += [*constant.notes(), *said]
+    notes += [*constant.notes(), *said, *told_of_components(names.displacement, first.point_fields)]
     if source.is_dir():
         by_time, said = ordered([file for (file,) in files], kept.times)
         kept.reorder(by_time)
@@ -253,11 +254,11 @@ def frames(source: Path) -> Iterator[SourceMesh]:
 
 def _displacement(frame: SourceMesh, names: FieldNames) -> np.ndarray | None:
     """The displacements of the points [n, 3]; None if the file holds none."""
-    name = names.displacement or "displacement"
-    parts = [] if name in frame.point_fields else fields_of_components(name, frame.point_fields)
-    if names.displacement is None and name not in frame.point_fields and not parts:
+    parts = fields_of_components(names.displacement, frame.point_fields)
+    if names.displacement is None and "displacement" not in frame.point_fields and not parts:
         return None
-    value = np.concatenate([raw_field(frame, "point", one) for one in parts or [name]], axis=1)
+    fields = parts or [names.displacement or "displacement"]
+    value = np.concatenate([raw_field(frame, "point", one) for one in fields], axis=1)
     if value.shape[1] not in (2, 3):
         raise DatasetError(f"{frame.path}: the displacement has {value.shape[1]} components; must have 2 or 3")
     if value.shape[1] == 2 and any(block.dimension == 3 for block in frame.blocks):

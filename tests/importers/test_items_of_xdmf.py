@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from test_series_of_xdmf import CUBE, FRAMES, POINTS, displacement, geometry, item, require_right, series, topology
 
+from ast_sim.importers.convert import convert
 from ast_sim.importers.mesh_file import read_mesh
 from ast_sim.importers.series import FieldNames, read_series
 from ast_sim.support.errors import DatasetError
@@ -94,7 +95,13 @@ def test_a_displacement_in_fields_of_its_components(tmp_path, stem, ends):
     ]
     path = with_fields(tmp_path / "a.xdmf", fields)
     names = FieldNames(displacement=None if stem == "displacement" else stem, handle="0:zmin")
-    np.testing.assert_allclose(read_series(path, names).position, POINTS + MOVED, rtol=1e-6, atol=1e-7)
+    if stem == "displacement" and any(end.strip("[]").isdigit() for end in ends):
+        names = FieldNames(displacement="displacement", handle="0:zmin")
+        with pytest.raises(DatasetError, match="moves"):  # they may be load cases: nobody has named them
+            convert(path, tmp_path / "d.h5", names=FieldNames(handle="0:zmin"), splits={"train": 1})
+    result = read_series(path, names)
+    np.testing.assert_allclose(result.position, POINTS + MOVED, rtol=1e-6, atol=1e-7)
+    assert f"the displacement is put together from {stem}" in result.attributes["notes"]
 
 
 @pytest.mark.parametrize(
@@ -159,3 +166,22 @@ def test_numbers_whose_meaning_is_not_clear_are_refused_by_name(tmp_path, case):
     inner, told = WRONG[case]
     with pytest.raises(DatasetError, match=f"a.xdmf: .*{told}"):
         read_series(with_fields(tmp_path / "a.xdmf", 3 * [attribute(inner)]), FieldNames(handle="0:zmin"))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        (' Name="displacement"', "", r"a field \(Attribute\) without a Name"),
+        ('GeometryType="XYZ"', 'Type="ORIGIN_DXDYDZ"', "a Geometry of the type ORIGIN_DXDYDZ; must be one of XYZ, XY"),
+        ('GeometryType="XYZ"', 'GeometryType="VXVYVZ"', "a Geometry of the type VXVYVZ"),
+        (geometry(), 2 * geometry(), "a grid has 2 entries Geometry; must have one"),
+        (topology(), 2 * topology(), "a grid has 2 entries Topology; must have one"),
+    ],
+)
+def test_what_a_grid_may_say_once_and_of_points_alone(tmp_path, old, new, told):
+    """meshio takes one of two, and the numbers of a regular grid for points."""
+    path = series(tmp_path / "a.xdmf", [topology() + geometry() + displacement(frame) for frame in FRAMES])
+    assert old in path.read_text()
+    path.write_text(path.read_text().replace(old, new, 1))
+    with pytest.raises(DatasetError, match=f"a.xdmf: .*{told}"):
+        read_series(path, FieldNames(handle="0:zmin"))

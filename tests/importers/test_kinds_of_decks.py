@@ -328,3 +328,18 @@ def test_nodes_are_given_in_a_system_of_their_own(tmp_path, lines, points):
     else:
         with pytest.raises(DatasetError, match="SYSTEM: its points lie on a line"):
             read_mesh(path)
+
+
+@pytest.mark.parametrize(
+    ("lines", "told"),
+    [
+        (["*NSET, NSET=A, NSET=B", "1"], "the option NSET stands twice, as 'A' and 'B'"),
+        (["*ELEMENT, TYPE=C3D8, TYPE=C3D4", "99, 1, 2, 3, 4"], "the option TYPE stands twice, as 'C3D8' and 'C3D4'"),
+        (["*NSET, NSET=A, N SET=a", "1"], "the option NSET stands twice, as 'A' and 'a'"),
+    ],
+)
+def test_an_option_with_two_values_is_refused(tmp_path, lines, told):
+    """The last one counted."""
+    with pytest.raises(DatasetError, match=rf"deck.inp:\d+: {told}"):
+        read_mesh(deck(tmp_path, *lines))
+    assert read_mesh(deck(tmp_path, "*NSET, NSET=A, NSET=A", "1")).groups["A"].tolist() == [0]

@@ -258,3 +258,40 @@ def test_displacements_at_the_start_are_no_rest(tmp_path):
     with pytest.raises(DatasetError, match="give DISPLACEMENT, so displacement at rest is not 0"):
         read(job("moved", "DISPLACEMENT"))
     assert "nodes move at the start (*INITIAL CONDITIONS)" in read(job("fast", "VELOCITY")).attributes["notes"]
+
+
+CYLINDER = ["*TRANSFORM, NSET=TOP, TYPE=C", "1., 1., 0., 1., 1., 1."]
+
+
+@pytest.mark.parametrize(
+    ("boundary", "driven"),
+    [(["TOP, 1, 1", "TOP, 2, 2, 0.1", "TOP, 3, 3"], True), (["TOP, 1, 2"], False)],
+    ids=["turned about the axis", "free along it"],
+)
+def test_nodes_with_cylindrical_axes_are_moved_and_held_along_these(tmp_path, boundary, driven):
+    """*BOUNDARY counts radius, angle and axis there; the results stand along x, y and z."""
+    load = [] if driven else ["*CLOAD", "TOP, 3, -1."]
+    result = read(solved(tmp_path, cube(step("*BOUNDARY", *boundary, *load), model=CYLINDER)))
+    top = HEIGHT == 2
+    assert (result.scene.node_type[top] == (NodeType.HANDLE if driven else NodeType.NORMAL)).all()
+    assert ("9 nodes are held in some directions only" in result.attributes["notes"]) != driven
+    way = (result.position[-1] - result.scene.rest_position)[top]
+    radius = (CUBE.rest_position - (1, 1, 0))[top]
+    assert np.abs((way * radius)[:, :2].sum(axis=1)).max() < 1e-5  # nothing along the radius
+    assert (np.abs(way[:, :2]).max() > 0.05) == driven
+
+
+def test_the_free_axes_of_a_rigid_body_may_be_its_own(tmp_path):
+    own = ["*NSET, NSET=R", "998", "*TRANSFORM, NSET=R, TYPE=R", "0., 1., 0., -1., 0., 0."]
+    boundary = ["*BOUNDARY", "998, 2, 3, 0.05", "999, 1, 3"]
+    notes = read(solved(tmp_path, cube(step(*boundary), model=[*TURNED, *own]))).attributes["notes"]
+    assert "the rigid body TOP is free along x of *TRANSFORM: this motion is taken from the results" in notes
+    notes = read(solved(tmp_path, cube(step(*boundary), model=TURNED))).attributes["notes"]
+    assert "the rigid body TOP is free along x: this motion" in notes
+
+
+def test_a_sector_of_a_cyclic_model_is_told(tmp_path):
+    job = solved(tmp_path, cube(step(*moved(-0.1))))
+    cyclic = "*CYCLIC SYMMETRY MODEL, N=4, TIE=T\n0., 0., 0., 0., 0., 1.\n*STEP"
+    job[0].write_text(job[0].read_text().replace("*STEP", cyclic, 1))
+    assert "constraints are not read: CYCLICSYMMETRYMODEL; mark nodes" in read(job).attributes["notes"]

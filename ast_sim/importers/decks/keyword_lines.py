@@ -105,7 +105,10 @@ def _options(line: Line, text: str) -> dict[str, str]:
         option = _NAMED.match(text, place)
         if option is None:
             raise DatasetError(f"{line.place}: the options {text.strip()!r} cannot be read")
-        options[re.sub(r"\s+", "", option[1]).upper()] = (option[2] or "").strip().strip('"')
+        name = re.sub(r"\s+", "", option[1]).upper()
+        value = (option[2] or "").strip().strip('"')
+        if options.setdefault(name, value) != value:
+            raise DatasetError(f"{line.place}: the option {name} stands twice, as {options[name]!r} and {value!r}")
         place = option.end()
     return options
 

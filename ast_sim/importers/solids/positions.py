@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
@@ -25,16 +25,26 @@ _ROUNDING = 0.01
 _COMPONENT = re.compile(r"(.*?)[ _.:(\[-]*([xyz123])[)\]]?", re.IGNORECASE)
 
 
-def fields_of_components(name: str, fields: Iterable[str]) -> list[str]:
-    """The fields of the components along x, y and, if there is one, z of a vector that is no field itself: U1, U2 and
-    U3 of U. None if x or y is missing, or a component stands twice."""
+def fields_of_components(named: str | None, fields: Collection[str]) -> list[str]:
+    """The fields of the components along x, y and, if there is one, z of a displacement that is no field itself: U1, U2
+    and U3 of U. None if x or y is missing, or a component stands twice; if it is not `named`, it is "displacement", and
+    numbers count for nothing: they may be the ones of load cases."""
+    name = named or "displacement"
+    if name in fields:
+        return []
     axes: dict[str, list[str]] = {}
     for field in fields:
         match = _COMPONENT.fullmatch(field.strip())
-        if match and match[1].casefold() == name.casefold():
+        if match and match[1].casefold() == name.casefold() and (named or not match[2].isdigit()):
             axes.setdefault("xyz"["xyz123".index(match[2].lower()) % 3], []).append(field)
     once = sorted(axes) in ([*"xy"], [*"xyz"]) and all(len(held) == 1 for held in axes.values())
     return [axes[axis][0] for axis in sorted(axes)] if once else []
+
+
+def told_of_components(named: str | None, fields: Collection[str]) -> list[str]:
+    """A note on a displacement that is put together, if it is; see `fields_of_components`."""
+    parts = fields_of_components(named, fields)
+    return [f"the displacement is put together from {', '.join(parts)}"] if parts else []
 
 
 def rest_and_position(

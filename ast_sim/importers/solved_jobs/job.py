@@ -39,7 +39,9 @@ _PLANE = ("CPE", "CPS", "CPEG", "CAX", "CGAX")
 
 # What acts on nodes and is in no scene.
 _LOADS = {"CLOAD", "DLOAD", "DSLOAD", "TEMPERATURE", "DFLUX", "CFLUX", "FILM", "RADIATE", "PRE-TENSIONSECTION"}
-_CONSTRAINTS = {"EQUATION", "MPC", "COUPLING", "KINEMATIC", "DISTRIBUTING", "DISTRIBUTINGCOUPLING", "TIE"}
+_CONSTRAINTS = {
+    *("EQUATION", "MPC", "COUPLING", "KINEMATIC", "DISTRIBUTING", "DISTRIBUTINGCOUPLING", "TIE", "CYCLICSYMMETRYMODEL"),
+}
 _PROCEDURES = {
     *("STATIC", "DYNAMIC", "VISCO", "HEATTRANSFER"),
     *("COUPLEDTEMPERATURE-DISPLACEMENT", "UNCOUPLEDTEMPERATURE-DISPLACEMENT"),
@@ -73,7 +75,7 @@ class Job:
 @dataclass(eq=False)
 class _Conditions:
     """Which directions of which points [n, 6] are prescribed now, in some step, and in all; which points [n] are
-    prescribed to move or to turn, or belong to a rigid body that is prescribed."""
+    prescribed to move or to turn, belong to a rigid body that is prescribed, or have axes of their own (*TRANSFORM)."""
 
     now: np.ndarray
     sometimes: np.ndarray
@@ -81,6 +83,7 @@ class _Conditions:
     moved: np.ndarray
     turned: np.ndarray
     rigid: np.ndarray
+    own_axes: np.ndarray
     notes: list[str] = field(default_factory=list)
 
     def end_step(self) -> None:
@@ -149,8 +152,8 @@ def _require_plain_results(deck: Deck) -> None:
 def _conditions(deck: Deck, mesh: SourceMesh) -> _Conditions:
     shape = (len(mesh.points), _DIRECTIONS)
     free = np.zeros(shape, bool)
-    moved, turned, rigid = (free[:, 0].copy() for _ in range(3))
-    state = _Conditions(free.copy(), free.copy(), np.ones(shape, bool), moved, turned, rigid)
+    moved, turned, rigid, own_axes = (free[:, 0].copy() for _ in range(4))
+    state = _Conditions(free.copy(), free.copy(), np.ones(shape, bool), moved, turned, rigid, own_axes)
     renewed = False
     for keyword in deck.keywords:
         if keyword.name == "BOUNDARY":
@@ -163,6 +166,8 @@ def _conditions(deck: Deck, mesh: SourceMesh) -> _Conditions:
             renewed = False
         elif keyword.name == "ENDSTEP":
             state.end_step()
+        elif keyword.name == "TRANSFORM":
+            state.own_axes[rows_of_target(keyword, keyword.required("NSET"), mesh)] = True
     for keyword in deck.keywords:
         if keyword.name == "RIGIDBODY":
             _rigid_body(keyword, state, mesh)
@@ -198,10 +203,12 @@ def _rigid_body(keyword: Keyword, state: _Conditions, mesh: SourceMesh) -> None:
     at = rows_of_target(keyword, reference, mesh)
     turns = state.sometimes[at, 3:].any(axis=0)
     is_turned = state.turned[at].any()
+    own_axes = state.own_axes[at].any()
     if "ROTNODE" in keyword.options:
         turning = rows_of_target(keyword, keyword.options["ROTNODE"], mesh)
         turns |= state.sometimes[turning, :3].any(axis=0)
         is_turned |= state.moved[turning].any()
+        own_axes |= state.own_axes[turning].any()
     shifts = state.sometimes[at, :3].any(axis=0)
     if not shifts.any() and not is_turned:
         state.notes.append(f"the rigid body {name} is prescribed nowhere: its nodes count as free")
@@ -212,7 +219,8 @@ def _rigid_body(keyword: Keyword, state: _Conditions, mesh: SourceMesh) -> None:
             *(f"along {axis}" for axis in np.array([*"xyz"])[~shifts]),
             *(f"about {a}" for a in np.array([*"xyz"])[~turns]),
         ]
-        state.notes.append(f"the rigid body {name} is free {', '.join(axes)}: this motion is taken from the results")
+        free = f"{', '.join(axes)}{' of *TRANSFORM' if own_axes else ''}"
+        state.notes.append(f"the rigid body {name} is free {free}: this motion is taken from the results")
 
 
 def _node_type(mesh: SourceMesh, conditions: _Conditions) -> np.ndarray:

@@ -17,6 +17,9 @@ from ast_sim.importers.meshio_files import by_meshio, what_meshio_says
 from ast_sim.importers.xdmf.xdmf_items import made_of_others, with_joined_points, write_out
 from ast_sim.support.errors import DatasetError
 
+# How the coordinates of points may stand.
+_POINTS = ("XYZ", "XY", "X_Y_Z", "X_Y")
+
 
 def xdmf_frames(path: Path) -> Iterator[SourceMesh]:
     """The frames of a series; a file without a series is one frame. Frames that have a geometry or cells of their own
@@ -151,7 +154,16 @@ def _require_understood(path: Path, tree: ET.ElementTree[Any]) -> None:
             )
         if topology.get("Order"):
             raise DatasetError(f"{path}: its cells have an Order of nodes; must be the one of XDMF, without an Order")
+    for geometry in tree.iter("Geometry"):
+        kind = geometry.get("GeometryType", geometry.get("Type", "XYZ")).upper()
+        if kind not in _POINTS:
+            raise DatasetError(f"{path}: has a Geometry of the type {kind}; must be one of {', '.join(_POINTS)}")
     for grid in tree.iter("Grid"):
+        for part in ("Geometry", "Topology"):
+            if len(grid.findall(part)) > 1:
+                raise DatasetError(f"{path}: a grid has {len(grid.findall(part))} entries {part}; must have one")
+        if any(not one.get("Name") for one in grid.findall("Attribute")):
+            raise DatasetError(f"{path}: a grid has a field (Attribute) without a Name: name it")
         fields = [(one.get("Name"), one.get("Center", "Node")) for one in grid.findall("Attribute")]
         twice = next((name for name, center in fields if fields.count((name, center)) > 1), None)
         if twice is not None:
