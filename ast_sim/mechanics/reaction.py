@@ -41,6 +41,10 @@ class Reaction:
         driven: the moved nodes.
         law: of all elements; rigid ones ignore it.
         contact: between the bodies. None: it is not known, and what goes straight into held nodes is left out.
+
+    Attributes:
+        unseen: whether in some positions contact went straight into faces without a free node. These forces are
+            missing.
     """
 
     def __init__(self, scene: Scene, driven: Driven, law: NeoHookean, contact: ContactForces | None = None) -> None:
@@ -49,6 +53,7 @@ class Reaction:
         self.scene = scene
         self.driven = driven
         self._contact = contact
+        self.unseen = False
         self._rest = scene.rest_position.astype(np.float64)
         soft = np.flatnonzero(~scene.rigid_elements)
         self._elasticity = elastic_body(self._rest, scene.elements[soft], law.of(soft))
@@ -80,10 +85,10 @@ class Reaction:
         position = position.astype(np.float64)
         pairs = None if self._contact is None else self._contact.directions(position)
         source, sink = self._ends(position, pairs)
-        if not source.any():
-            return np.zeros_like(position)
         forces, _ = self._elasticity.gradient(self._elasticity.evaluate(position))
-        shares = self._field(source, sink, self._folds(position))[:, None] * forces
+        shares = np.zeros_like(position)
+        if source.any():
+            shares = self._field(source, sink, self._folds(position))[:, None] * forces
         if self._contact is None or pairs is None:
             return shares
         return shares + self._straight(self._contact, pairs, forces)
@@ -95,6 +100,8 @@ class Reaction:
         pushes_others = self.driven.body in self.scene.rigid_bodies
         held = self.scene.prescribed & self._deforming & ~of_body if pushes_others else self.driven.nodes
         straight = _of(pairs, held) & _of(pairs, of_body)
+        free = ~self.scene.prescribed & self._deforming
+        self.unseen |= bool((straight & ~_of(pairs, free)).any())
         none = np.zeros_like(forces)
         if not straight.any():
             return none

@@ -143,6 +143,15 @@ def test_what_goes_straight_into_held_nodes_counts(tmp_path, friction, tolerance
     np.testing.assert_array_equal(force.shares(shaken), strains.shares(shaken))  # forces of no equilibrium show nothing
 
 
+def test_a_face_whose_nodes_are_all_held_shows_no_force(tmp_path):
+    """The punch comes within the range of contact of the held face: the solver stores a force, positions have none."""
+    scene, truth = solved(tmp_path, SPEC.replace('fixed = "zmin"', 'fixed = "zmax"'), travel=0.17)
+    force = Reaction(scene, Driven.of(scene, truth.position), law_of(scene), ContactForces(scene, 0.05, 0.0))
+    assert not force.of(truth.position[1]).any() and not force.unseen
+    assert not force.of(truth.position[-1]).any() and force.unseen
+    assert truth.attributes["reaction"][-1] > 1
+
+
 @pytest.mark.parametrize("known", [True, False])
 def test_a_fine_tool_on_a_coarse_part(tmp_path, known):
     """The tool stands within one face, whose corners are many of its own edges away: what is near is a matter of the

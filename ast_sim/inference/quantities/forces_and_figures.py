@@ -18,7 +18,7 @@ from ast_sim.mechanics.driven import Driven
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean
 from ast_sim.named_field import REACTION
 from ast_sim.number_arrays import three_numbers
-from ast_sim.support.errors import AstSimError, ConfigError, SimulationError
+from ast_sim.support.errors import AstSimError, ConfigError, SimulationError, warn
 from ast_sim.view import sweep_files
 from ast_sim.view.files import make_folder
 
@@ -143,6 +143,12 @@ def _newton(answer: Answer, driven: Driven) -> np.ndarray:
     assert answer.info is not None and answer.law is not None
     reaction = Reaction(answer.scene, driven, law, answer.law.contact_forces(answer.scene))
     shares = [reaction.shares(position) for position in answer.position]
+    if reaction.unseen:
+        warn(
+            f"{answer.name}: body {driven.body} touches faces whose nodes are all held. What it presses straight into"
+            " them strains nothing, and is missing in its force: a model that predicts reactions (state=['reaction'],"
+            " --state reaction) has it"
+        )
     return LENGTH_UNITS[answer.info.length_unit] ** 2 * np.array(shares).reshape(-1, answer.scene.num_nodes, 3)
 
 
