@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from meshes import box
 from scipy.optimize import nnls
+from simulate.own_assembly.assemblies import write_assembly, write_box
 from solids import blocks, pressed, scene_of
 
 from ast_sim.mechanics.elements.elasticity import Elasticity
@@ -15,6 +16,9 @@ from ast_sim.mechanics.linearised import linearised_contact
 from ast_sim.mechanics.linearised.linearised_contact import STILL, NewtonSteps
 from ast_sim.mechanics.quasi_static import quasi_static, solve_frame
 from ast_sim.scene import NodeType
+from ast_sim.simulate.families import assembly
+from ast_sim.simulate.own_assembly.parameters import completed
+from ast_sim.simulate.own_assembly.spec_reader import read_spec
 from ast_sim.simulate.shapes import mesh
 from ast_sim.support import nearest_surface
 from ast_sim.support.errors import SimulationError
@@ -36,6 +40,17 @@ def squeezed():
     assert found.failure == ""
     free = ~case.scene.prescribed
     return case, found.position, free, rms((found.position - case.prescribed_position[0])[free])
+
+
+@pytest.fixture(scope="module")
+def fine_tool(tmp_path_factory):
+    """A block under a punch of much smaller edges: the case and the solver's positions."""
+    spec = write_assembly(tmp_path_factory.mktemp("fine"))
+    write_box(spec.parent / "block.vtu", (0, 0, 0), (10, 10, 5), (6, 6, 3))
+    write_box(spec.parent / "punch.vtu", (3.2, 3.1, 5.2), (6.7, 6.8, 8), (16, 16, 8))
+    read = read_spec(spec)
+    case = assembly.scene_of(read, completed(read.parameters, {"travel": 1.4}), None, read.frames).case
+    return case, assembly.solve(case).position[-1].astype(float)
 
 
 @pytest.fixture(params=[True, False])
@@ -214,6 +229,23 @@ def test_forces_of_contact_are_those_of_least_squares():
         np.testing.assert_allclose(forces, others, atol=1e-6 * others.max())
         gap = give @ forces + offset
         assert forces.min() >= 0 and gap.min() >= -1e-8 and abs(gap[forces > 0]).max() < 1e-8
+
+
+@pytest.mark.parametrize("share", [0.9, 0.7, 0.0])
+def test_a_fine_tool_on_a_coarse_part(fine_tool, share):
+    """Far more pairs than degrees of freedom touch, and what is near or still is a matter of the part's mesh. Steps
+    from 10 % short, 30 % short and rest end within a few percent: the edges of the tool are sharp."""
+    case, truth = fine_tool
+    rest, free = case.scene.rest_position.astype(float), ~case.scene.prescribed
+    solver = NewtonSteps(case.scene, case.material, 0.8 * case.contact.dhat)
+    position = np.where(free[:, None], rest + share * (truth - rest), truth)
+    for step in range(8):
+        before, position = position, solver.step(position, from_afar=step == 0)
+        if solver.size(before, position) <= STILL:
+            break
+    else:
+        pytest.fail("the steps do not end")
+    assert rms((position - truth)[free]) < 0.06 * rms((truth - rest)[free])
 
 
 def test_a_step_can_be_watched_and_stopped(squeezed, way):

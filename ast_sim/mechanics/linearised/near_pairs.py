@@ -38,7 +38,7 @@ class NearSurfaces:
         dofs: [F] the degrees of freedom by which pairs are derived; a pair that none of them moves is left out.
 
     Attributes:
-        length: the mean edge length of the surfaces.
+        length: the mean edge length of the surfaces that deform: a tool may be meshed much finer.
     """
 
     def __init__(self, scene: Scene, dofs: np.ndarray) -> None:
@@ -47,8 +47,9 @@ class NearSurfaces:
         self._number = np.full(3 * scene.num_nodes, -1)
         self._number[dofs] = np.arange(len(dofs))
         faces = scene.surface().astype(np.int64)
-        owner, edge = scene.body[faces[:, 0]], self._rest[faces[:, 0]] - self._rest[faces[:, 1]]
-        self.length = float(np.linalg.norm(edge, axis=1).mean())
+        owner = scene.body[faces[:, 0]]
+        soft = faces[scene.deforming_nodes[faces[:, 0]]]
+        self.length = float(np.linalg.norm(self._rest[soft[:, 0]] - self._rest[soft[:, 1]], axis=1).mean())
         nodes = np.unique(faces)
         self._surfaces = [(faces[owner == body], nodes[scene.body[nodes] != body]) for body in np.unique(owner)]
 
