@@ -17,7 +17,7 @@ def test_a_scene_from_end_to_end(tmp_path, monkeypatch, one_thread):
     nested.main(["100", "--folder", str(tmp_path)])
     (scene,) = json.loads(nested.RESULTS.read_text())["100"]["measured"]
     assert (
-        len(scene["variants"]) == 35
+        len(scene["variants"]) == 36
         and len(nested.NESTED) == 20
         and list(scene["answers"]) == [effort.text for effort in nested.EFFORTS]
     )
@@ -70,7 +70,7 @@ def test_rows_say_in_how_many_settings_the_solver_was_run():
     every = [variant.name for variant in VARIANTS]
     old = [row("A", *plain), row("B", *plain)]
     assert settings_tried(old) == "13 settings"
-    assert settings_tried([row("C", *every)]) == settings_tried([]) == "35 settings, nested iteration among them,"
+    assert settings_tried([row("C", *every)]) == settings_tried([]) == "36 settings, nested iteration among them,"
     assert settings_tried([*old, row("C", *every), row("D", *every)]) == (
-        "13 settings (35, nested iteration among them, for C, D)"
+        "13 settings (36, nested iteration among them, for C, D)"
     )
