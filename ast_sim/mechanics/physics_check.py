@@ -215,7 +215,7 @@ class _Balance:
         elements = scene.elements[deforming].astype(np.int64)
         rest = scene.rest_position.astype(np.float64)
         self._elasticity = elastic_body(rest, elements, law.of_elements(scene).of(deforming))
-        self._contact = ContactForces(scene, law.contact_range, law.friction(scene))
+        self._contact = ContactForces(scene, law.contact_range, law.friction(scene), edges=True)
         self._held = scene.prescribed
 
     def of(self, position: np.ndarray) -> tuple[float, float]:

@@ -25,6 +25,7 @@ from ast_sim.mechanics.elements.neo_hookean import NeoHookean
 from ast_sim.mechanics.elements.second_order import elastic_body
 from ast_sim.mechanics.linearised.contact_forces import ContactForces
 from ast_sim.scene import Scene
+from ast_sim.support.errors import SimulationError
 
 REACH = 1.0  # a node counts as touched if another body is nearer than this, in mean lengths of the edges around it
 OPPOSITE = 0.5  # cosine between opposite normals, at most; at an edge, a normal is the mean of its faces
@@ -43,8 +44,8 @@ class Reaction:
         contact: between the bodies. None: it is not known, and what goes straight into held nodes is left out.
 
     Attributes:
-        unseen: whether in some positions contact went straight into faces without a free node. These forces are
-            missing.
+        unseen: whether in some positions contact went straight into held nodes and no free node shows how hard. These
+            forces are missing.
     """
 
     def __init__(self, scene: Scene, driven: Driven, law: NeoHookean, contact: ContactForces | None = None) -> None:
@@ -105,7 +106,11 @@ class Reaction:
         none = np.zeros_like(forces)
         if not straight.any():
             return none
-        sizes = contact.sizes(pairs, forces)
+        try:
+            sizes = contact.sizes(pairs, forces)
+        except SimulationError:
+            self.unseen = True
+            return none
         elastic = forces.ravel()[contact.free]
         left = elastic - (pairs.T @ sizes)[contact.free]
         if np.linalg.norm(left) > EXPLAINED * np.linalg.norm(elastic):

@@ -1,5 +1,6 @@
 """The force that moves a body: against closed forms, against the solver, and on positions with errors."""
 
+import sys
 from dataclasses import replace
 
 import meshio
@@ -124,11 +125,13 @@ def test_a_part_that_is_held_at_one_end_and_moved_at_the_other(tmp_path, order, 
         assert "torque" not in recorded
 
 
-@pytest.mark.parametrize(("friction", "tolerance"), [(0.0, 1e-3), (0.3, 0.01)])
-def test_what_goes_straight_into_held_nodes_counts(tmp_path, friction, tolerance):
-    """The punch stands on faces of which one corner is held: three fifths of its force strain no element."""
+@pytest.mark.parametrize(("friction", "tolerance"), [(0.0, 5e-3), (0.3, 0.01)])
+def test_what_goes_straight_into_held_nodes_counts(tmp_path, monkeypatch, friction, tolerance):
+    """The punch stands on faces of which one corner is held: three fifths of its force strain no element. Pairs of
+    edges, 0.4 % of the force, are left out, and so ipctk is not needed."""
     spec = SPEC.replace('fixed = "zmin"', 'fixed = "xmin"').replace("frames = 3", f"frames = 3\nfriction = {friction}")
     scene, truth = solved(tmp_path, spec.replace("rigid = true", "rigid = true\noffset = [-2, 0, 0]"), travel=0.5)
+    monkeypatch.setitem(sys.modules, "ipctk", None)
     contact, nodal = ContactForces(scene, 0.05, friction), truth.fields["reaction"].values
     punch, block = (scene.prescribed & (scene.body == body) for body in (1, 0))
     for body, nodes in ((1, punch), (0, block)):

@@ -145,9 +145,9 @@ def _newton(answer: Answer, driven: Driven) -> np.ndarray:
     shares = [reaction.shares(position) for position in answer.position]
     if reaction.unseen:
         warn(
-            f"{answer.name}: body {driven.body} touches faces whose nodes are all held. What it presses straight into"
-            " them strains nothing, and is missing in its force: a model that predicts reactions (state=['reaction'],"
-            " --state reaction) has it"
+            f"{answer.name}: body {driven.body} touches held nodes where no free node shows how hard. What it presses"
+            " straight into them strains nothing, and is missing in its force: a model that predicts reactions"
+            " (state=['reaction'], --state reaction) has it"
         )
     return LENGTH_UNITS[answer.info.length_unit] ** 2 * np.array(shares).reshape(-1, answer.scene.num_nodes, 3)
 

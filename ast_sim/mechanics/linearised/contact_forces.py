@@ -3,7 +3,7 @@
 At equilibrium the elastic forces f on the free nodes are the forces of contact, C^T l with l >= 0, where a row of C is
 the direction of the force of a near pair. On positions that are nearly right the l >= 0 are taken that leave least,
 min |f - C^T l|. With friction a pair of a node and a face has four directions, the corners of a pyramid inside
-Coulomb's cone. Where nothing overlaps, pairs of edges push, too (ipctk).
+Coulomb's cone. Where nothing overlaps, pairs of edges push, too; ipctk finds them.
 """
 
 from __future__ import annotations
@@ -26,21 +26,19 @@ class ContactForces:
     Args:
         contact_range: the distance below which surfaces push each other, in the unit of length.
         friction: Coulomb's coefficient.
+        edges: whether pairs of edges push, too. Without them residuals are larger, and ipctk is not needed.
 
     Attributes:
         free: [F] the degrees of freedom of the free nodes of deforming bodies.
+
+    Raises:
+        MissingExtra: ipctk is not installed, and is needed.
     """
 
-    def __init__(self, scene: Scene, contact_range: float, friction: float) -> None:
+    def __init__(self, scene: Scene, contact_range: float, friction: float, edges: bool = False) -> None:
         self._range, self._friction = contact_range, friction
         self._near = NearSurfaces(scene, np.arange(3 * scene.num_nodes))
-        settings = ContactSettings(contact_range, 1.0)
-        surface = scene.surface()
-        self._contact = Contact(
-            scene.rest_position.astype(np.float64), surface, scene.body, settings, ~scene.deforming_nodes
-        )
-        local = np.unique(surface, return_inverse=True)[1].reshape(-1, 3).astype(np.int32)
-        self._edges_and_faces = load_ipctk().edges(local), local
+        self._edges = _NearEdges(scene, contact_range) if edges else None
         of_soft = np.isin(np.arange(scene.num_nodes), scene.elements[~scene.rigid_elements])
         self.free = np.flatnonzero(np.repeat(of_soft & ~scene.prescribed, 3))
 
@@ -55,8 +53,8 @@ class ContactForces:
         if self._friction:
             tangents = [self._friction * pairs.directions[touching + axis * count] for axis in (1, 2)]
             parts = [normal + sign * tangent for tangent in tangents for sign in (1, -1)]
-        if not (pairs.gap < 0).any():  # a distance knows no sides: it says nothing of bodies that overlap
-            parts.append(self._near_directions(position))
+        if self._edges and not (pairs.gap < 0).any():  # a distance knows no sides: it says nothing of overlaps
+            parts.append(self._edges.directions(position))
         return scipy.sparse.csr_array(scipy.sparse.vstack(parts))
 
     def sizes(self, directions: scipy.sparse.csr_array, forces: np.ndarray) -> np.ndarray:
@@ -79,7 +77,19 @@ class ContactForces:
         except RuntimeError as error:
             raise SimulationError(f"the forces of contact were not found: {error}") from error
 
-    def _near_directions(self, position: np.ndarray) -> scipy.sparse.csr_array:
+
+class _NearEdges:
+    """The pairs that ipctk finds within the range of contact: of edges, and once more of nodes and faces."""
+
+    def __init__(self, scene: Scene, contact_range: float) -> None:
+        rest = scene.rest_position.astype(np.float64)
+        surface = scene.surface()
+        settings = ContactSettings(contact_range, 1.0)
+        self._contact = Contact(rest, surface, scene.body, settings, ~scene.deforming_nodes)
+        local = np.unique(surface, return_inverse=True)[1].reshape(-1, 3).astype(np.int32)
+        self._edges_and_faces = load_ipctk().edges(local), local
+
+    def directions(self, position: np.ndarray) -> scipy.sparse.csr_array:
         """[P, 3 N]: of each pair of nodes, edges or faces within the range of contact the derivative of its distance by
         the positions, with a length of 1."""
         contact = self._contact
