@@ -50,9 +50,14 @@ class SolidCase:
         course = self.course or Course(self.prescribed_position, self.scene.prescribed)
         return replace(self, prescribed_position=self.prescribed_position[list(stored)], course=course.storing(stored))
 
+    @property
+    def friction(self) -> float:
+        """The largest coefficient of friction that acts, for what knows one alone."""
+        return max(self.contact.frictions(self.scene))
+
     def contact_forces(self) -> ContactForces:
-        """The forces of its contact. They know one coefficient of friction; of several they get the largest."""
-        return ContactForces(self.scene, self.contact.dhat, max(self.contact.frictions(self.scene)))
+        """The forces of its contact, with one coefficient of friction."""
+        return ContactForces(self.scene, self.contact.dhat, self.friction)
 
     def notes(self) -> list[str]:
         """What a user should know of the scene, a sentence each."""

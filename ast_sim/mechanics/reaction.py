@@ -101,8 +101,7 @@ class Reaction:
         pushes_others = self.driven.body in self.scene.rigid_bodies
         held = self.scene.prescribed & self._deforming & ~of_body if pushes_others else self.driven.nodes
         straight = _of(pairs, held) & _of(pairs, of_body)
-        free = ~self.scene.prescribed & self._deforming
-        self.unseen |= bool((straight & ~_of(pairs, free)).any())
+        self.unseen |= bool((straight & (abs(pairs[:, contact.free]).sum(axis=1) == 0)).any())
         none = np.zeros_like(forces)
         if not straight.any():
             return none

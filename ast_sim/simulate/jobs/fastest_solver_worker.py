@@ -119,7 +119,7 @@ class VariantSolver:
     ) -> None:
         self.drawn, self.walk, self.truth, self.settings, self.effort = drawn, walk, truth, settings, effort
         self.frame = walk[-1]
-        self.path_counts = max(drawn.case.contact.frictions(drawn.case.scene)) > 0
+        self.path_counts = drawn.case.friction > 0
         self.free = ~drawn.case.scene.prescribed
         self.rest = drawn.case.scene.rest_position.astype(np.float64)
         self.displacement = _root_mean_square((truth - self.rest)[self.free])
@@ -321,8 +321,8 @@ class _Loads:
 
 
 def _newton_steps(case: SolidCase) -> NewtonSteps:
-    """The Newton steps of a case. They know one coefficient of friction; of several they get the largest."""
-    return NewtonSteps(case.scene, case.material, CLEARANCE * case.contact.dhat, case.contact.frictions(case.scene)[-1])
+    """The Newton steps of a case, with one coefficient of friction."""
+    return NewtonSteps(case.scene, case.material, CLEARANCE * case.contact.dhat, case.friction)
 
 
 def _root_mean_square(vectors: np.ndarray) -> float:

@@ -140,10 +140,9 @@ def _at_half_the_size(coarse: SolidCase, solved: Trajectory, fine: SolidCase, fr
 
 def _from_coarse(coarse: SolidCase, solved: Trajectory, fine: SolidCase, frame: int, end: float) -> np.ndarray:
     """As `_at_half_the_size`, from the frame of the coarse mesh; `end`: processor time at which it is given up."""
-    friction = max(coarse.contact.frictions(coarse.scene))
     stuck = None
-    steps = NewtonSteps(fine.scene, fine.material, CLEARANCE * coarse.contact.dhat, friction)
-    if friction:
+    steps = NewtonSteps(fine.scene, fine.material, CLEARANCE * coarse.contact.dhat, coarse.friction)
+    if coarse.friction:
         stuck = _near(steps, _start(coarse, solved, fine, frame - 1), None)
     position = _near(steps, _start(coarse, solved, fine, frame), stuck)
     frames = SolidFrames(fine, assembly.SETTINGS)
