@@ -170,7 +170,7 @@ class Contact:
             self._mesh.can_collide = self._unless_alike(np.where(fixed, together, alone))
         if whole.any():
             self._whole_mesh.can_collide = self._unless_alike(np.where(whole, together, alone))
-        self._barrier = ipctk.BarrierPotential(self._dhat, True)
+        self.barrier = ipctk.BarrierPotential(self._dhat, True)
         self._broad_phase = ipctk.LBVH()
         self._ccd = ipctk.AdditiveCCD()
         self._dofs = (3 * self.nodes[:, None] + np.arange(3)).ravel()
@@ -226,7 +226,7 @@ class Contact:
         """
         pairs = self._ipctk.TangentialCollisions()
         stiffness, friction = self.settings.stiffness, self.settings.friction
-        arguments = self._mesh, state.vertices, state.collisions, self._barrier, stiffness
+        arguments = self._mesh, state.vertices, state.collisions, self.barrier, stiffness
         if self.settings.pair_friction:
             between = functools.cache(self.settings.friction_between)
             # ipctk blends the coefficients of two vertices; here they are numbers of bodies.
@@ -293,7 +293,7 @@ class ContactState:
     def barrier_energy(self) -> float:
         """Barrier energy in joule."""
         contact = self._contact
-        energy = contact._barrier(self.collisions, contact._mesh, self.vertices)
+        energy = contact.barrier(self.collisions, contact._mesh, self.vertices)
         return contact.settings.stiffness * energy / contact._zoom**3
 
     def dissipation(self) -> float:
@@ -307,7 +307,7 @@ class ContactState:
         if self.collisions.empty():
             return np.zeros(self.vertices.shape)
         contact = self._contact
-        gradient = contact._barrier.gradient(self.collisions, contact._mesh, self.vertices)
+        gradient = contact.barrier.gradient(self.collisions, contact._mesh, self.vertices)
         return contact.settings.stiffness * gradient.reshape(-1, 3) / contact._zoom**2
 
     def friction_gradient(self) -> np.ndarray:
@@ -336,7 +336,7 @@ class ContactState:
         method = method.CLAMP if project else method.NONE
         parts = []
         if not self.collisions.empty():
-            barrier = contact._barrier.hessian(self.collisions, contact._mesh, self.vertices, method)
+            barrier = contact.barrier.hessian(self.collisions, contact._mesh, self.vertices, method)
             parts.append((barrier, contact.settings.stiffness))
         if self._sliding is not None:
             pairs, start = self._sliding

@@ -27,7 +27,6 @@ from ast_sim.mechanics.linearised.contact_forces import ContactForces
 from ast_sim.scene import Scene
 from ast_sim.support.errors import SimulationError
 
-REACH = 1.0  # a node counts as touched if another body is nearer than this, in mean lengths of the edges around it
 OPPOSITE = 0.5  # cosine between opposite normals, at most; at an edge, a normal is the mean of its faces
 EXPLAINED = 0.4  # held nodes get their share where contact leaves less than this of the elastic forces on free nodes
 SMOOTH = 1e-3  # residual to which the smooth field is computed; every field is exact at equilibrium
@@ -46,6 +45,8 @@ class Reaction:
     Attributes:
         unseen: whether in some positions contact went straight into held nodes and no free node shows how hard. These
             forces are missing.
+        without_edges: whether in some positions another body is near held nodes, and pairs of edges were left out,
+            because ipctk is not installed. The force is rough.
     """
 
     def __init__(self, scene: Scene, driven: Driven, law: NeoHookean, contact: ContactForces | None = None) -> None:
@@ -54,7 +55,7 @@ class Reaction:
         self.scene = scene
         self.driven = driven
         self._contact = contact
-        self.unseen = False
+        self.unseen = self.without_edges = False
         self._rest = scene.rest_position.astype(np.float64)
         soft = np.flatnonzero(~scene.rigid_elements)
         self._elasticity = elastic_body(self._rest, scene.elements[soft], law.of(soft))
@@ -63,7 +64,7 @@ class Reaction:
         surface = scene.surface()
         owner = scene.body[surface[:, 0]]  # a node of no element may be a body without a surface
         self._surfaces = {int(n): surface[owner == n] for n in np.unique(owner)}
-        self._reach = REACH * _edge_length(self._rest, surface)
+        self._reach = _longest_edge(self._rest, surface)
         self._deforming = np.zeros(scene.num_nodes, bool)
         self._deforming[scene.elements[soft]] = True
 
@@ -84,46 +85,45 @@ class Reaction:
     def shares(self, position: np.ndarray) -> np.ndarray:
         """[N,3] w_i f_i, the share of each node in that force, and what contact brings straight into held nodes."""
         position = position.astype(np.float64)
-        pairs = None if self._contact is None else self._contact.directions(position)
-        source, sink = self._ends(position, pairs)
+        nearest = self._nearest_body(position)
+        source, sink = self._ends(nearest)
         forces, _ = self._elasticity.gradient(self._elasticity.evaluate(position))
         shares = np.zeros_like(position)
         if source.any():
             shares = self._field(source, sink, self._folds(position))[:, None] * forces
-        if self._contact is None or pairs is None:
+        if self._contact is None or not (nearest[self.scene.prescribed & self._deforming] >= 0).any():
             return shares
-        return shares + self._straight(self._contact, pairs, forces)
+        return shares + self._straight(self._contact, position, forces)
 
-    def _straight(self, contact: ContactForces, pairs: scipy.sparse.csr_array, forces: np.ndarray) -> np.ndarray:
+    def _straight(self, contact: ContactForces, position: np.ndarray, forces: np.ndarray) -> np.ndarray:
         """[N,3] the forces of contact between the driven body and held nodes, where elastic `forces` [N,3] show them; 0
-        elsewhere, and on positions that are no equilibrium. `pairs` are the directions of contact."""
+        elsewhere, and on positions that are no equilibrium."""
+        self.without_edges |= contact.barrier_pairs is None
+        pairs = contact.pairs(position)
         of_body = self.scene.body == self.driven.body
         pushes_others = self.driven.body in self.scene.rigid_bodies
         held = self.scene.prescribed & self._deforming & ~of_body if pushes_others else self.driven.nodes
-        straight = _of(pairs, held) & _of(pairs, of_body)
-        self.unseen |= bool((straight & (abs(pairs[:, contact.free]).sum(axis=1) == 0)).any())
+        straight = _of(pairs.normal, held) & _of(pairs.normal, of_body)
+        self.unseen |= bool((straight & (abs(pairs.normal[:, contact.free]).sum(axis=1) == 0)).any())
         none = np.zeros_like(forces)
         if not straight.any():
             return none
         try:
-            sizes = contact.sizes(pairs, forces)
+            pushes = contact.forces(pairs, forces)
         except SimulationError:
             self.unseen = True
             return none
         elastic = forces.ravel()[contact.free]
-        left = elastic - (pairs.T @ sizes)[contact.free]
+        left = elastic - pushes.sum(axis=0)[contact.free]
         if np.linalg.norm(left) > EXPLAINED * np.linalg.norm(elastic):
             return none
-        pushed = (pairs[straight].T @ sizes[straight]).reshape(-1, 3)
+        pushed = pushes[straight].sum(axis=0).reshape(-1, 3)
         return np.where(held[:, None], pushed if pushes_others else -pushed, none)
 
-    def _ends(self, position: np.ndarray, pairs: scipy.sparse.csr_array | None) -> tuple[np.ndarray, np.ndarray]:
+    def _ends(self, nearest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """[N] bool twice: the deforming nodes on which the moved nodes act, and all others that are held or touched."""
         scene = self.scene
         driven = self.driven
-        nearest = self._nearest_body(position)
-        if pairs is not None:
-            nearest = self._with_touched_corners(nearest, pairs)
         held = scene.prescribed & self._deforming
         touched = (nearest == driven.body) & ~held
         source = touched if driven.body in scene.rigid_bodies else held & driven.nodes
@@ -149,16 +149,6 @@ class Reaction:
                 closer = square < nearest[nodes]
                 nearest_body[nodes[closer]], nearest[nodes[closer]] = body, square[closer]
         return nearest_body
-
-    def _with_touched_corners(self, nearest: np.ndarray, pairs: scipy.sparse.csr_array) -> np.ndarray:
-        """`nearest` [N], and for deforming nodes that are near nothing themselves the body that touches a face or an
-        edge of theirs. In coarse meshes a tool stands on a face whose corners are out of reach."""
-        body = self.scene.body
-        for other in self._surfaces:
-            of_pairs = np.flatnonzero(_of(pairs, body == other))
-            touched = abs(pairs[of_pairs]).sum(axis=0).reshape(-1, 3).any(axis=1)
-            nearest = np.where(touched & (body != other) & self._deforming & (nearest < 0), other, nearest)
-        return nearest
 
     def _folds(self, position: np.ndarray) -> np.ndarray:
         """[2, P] pairs of nodes of a deforming body whose surfaces look at each other across a gap within reach, and
@@ -216,9 +206,9 @@ def _of(directions: scipy.sparse.csr_array, nodes: np.ndarray) -> np.ndarray:
     return abs(directions) @ np.repeat(nodes, 3).astype(float) > 0
 
 
-def _edge_length(rest: np.ndarray, surface: np.ndarray) -> np.ndarray:
-    """[N] the mean length of the edges around each node of a surface [F,3]; 0 at nodes inside."""
+def _longest_edge(rest: np.ndarray, surface: np.ndarray) -> np.ndarray:
+    """[N] the longest of the edges around each node of a surface [F,3]; 0 at nodes inside."""
     ends = surface[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-    lengths = np.repeat(np.linalg.norm(rest[ends[:, 0]] - rest[ends[:, 1]], axis=1), 2)
-    total, count = (np.bincount(ends.ravel(), weights, minlength=len(rest)) for weights in (lengths, None))
-    return total / np.maximum(count, 1)
+    longest = np.zeros(len(rest))
+    np.maximum.at(longest, ends.ravel(), np.repeat(np.linalg.norm(rest[ends[:, 0]] - rest[ends[:, 1]], axis=1), 2))
+    return longest

@@ -6,10 +6,9 @@ from dataclasses import replace
 import meshio
 import numpy as np
 import pytest
-from simulate.own_assembly.assemblies import SPEC, box, write_assembly, write_box
+from simulate.own_assembly.assemblies import SPEC, box, case_of, write_assembly, write_box
 
 from ast_sim.material import Material
-from ast_sim.mechanics import reaction
 from ast_sim.mechanics.driven import Driven
 from ast_sim.mechanics.elements.elasticity import Elasticity
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean
@@ -17,17 +16,14 @@ from ast_sim.mechanics.linearised.contact_forces import ContactForces
 from ast_sim.mechanics.reaction import Reaction
 from ast_sim.scene import NodeType, Scene
 from ast_sim.simulate.families import assembly
-from ast_sim.simulate.own_assembly.parameters import completed
-from ast_sim.simulate.own_assembly.spec_reader import read_spec
 from ast_sim.simulate.shapes.parts import rectilinear
 
 YOUNG, POISSON = 1.5e6, 0.3
 
 
 def solved(folder, spec=SPEC, **given):
-    read = read_spec(write_assembly(folder, spec))
-    drawn = assembly.scene_of(read, completed(read.parameters, given), None, read.frames)
-    return drawn.case.scene, assembly.solve(drawn.case)
+    case = case_of(write_assembly(folder, spec), **given)
+    return case.scene, assembly.solve(case)
 
 
 def law_of(scene: Scene) -> NeoHookean:
@@ -125,13 +121,26 @@ def test_a_part_that_is_held_at_one_end_and_moved_at_the_other(tmp_path, order, 
         assert "torque" not in recorded
 
 
-@pytest.mark.parametrize(("friction", "tolerance"), [(0.0, 5e-3), (0.3, 0.01)])
-def test_what_goes_straight_into_held_nodes_counts(tmp_path, monkeypatch, friction, tolerance):
-    """The punch stands on faces of which one corner is held: three fifths of its force strain no element. Pairs of
-    edges, 0.4 % of the force, are left out, and so ipctk is not needed."""
+def straight_into_a_clamp(folder, friction, motion):
+    """The punch stands on faces of which one corner is held: three fifths of its force strain no element."""
     spec = SPEC.replace('fixed = "zmin"', 'fixed = "xmin"').replace("frames = 3", f"frames = 3\nfriction = {friction}")
-    scene, truth = solved(tmp_path, spec.replace("rigid = true", "rigid = true\noffset = [-2, 0, 0]"), travel=0.5)
-    monkeypatch.setitem(sys.modules, "ipctk", None)
+    spec = spec.replace("rigid = true", "rigid = true\noffset = [-2, 0, 0]").replace("[0, 0, '-travel']", motion)
+    return solved(folder, spec, travel=0.5)
+
+
+@pytest.mark.parametrize(
+    ("friction", "motion", "tolerance"),
+    [
+        (0.0, "[0, 0, '-travel']", 1e-4),
+        (0.3, "[0, 0, '-travel']", 0.01),
+        (0.3, "['0.6 * travel', '0.6 * travel', '-travel']", 0.01),
+    ],
+    ids=["smooth", "rough", "across the axes"],
+)
+def test_what_goes_straight_into_held_nodes_counts(tmp_path, friction, motion, tolerance):
+    """With four rays of Coulomb's cone alone, the force of the last case is 5 % off. (The solver takes the sizes of
+    friction from the iteration before: this is what is left.)"""
+    scene, truth = straight_into_a_clamp(tmp_path, friction, motion)
     contact, nodal = ContactForces(scene, 0.05, friction), truth.fields["reaction"].values
     punch, block = (scene.prescribed & (scene.body == body) for body in (1, 0))
     for body, nodes in ((1, punch), (0, block)):
@@ -141,9 +150,35 @@ def test_what_goes_straight_into_held_nodes_counts(tmp_path, monkeypatch, fricti
             away = np.linalg.norm(force.of(position) - stored)
             assert away < tolerance * np.linalg.norm(stored)
             assert np.linalg.norm(strains.of(position) - stored) > 0.5 * np.linalg.norm(stored)
+        assert not force.without_edges
     shaken = truth.position[-1] + np.random.default_rng(0).normal(0, 0.05, truth.position[-1].shape)
     shaken[scene.prescribed] = truth.position[-1][scene.prescribed]
     np.testing.assert_array_equal(force.shares(shaken), strains.shares(shaken))  # forces of no equilibrium show nothing
+
+
+def test_without_ipctk_pairs_of_edges_are_missing(tmp_path, monkeypatch):
+    """They carry 0.4 % of this force."""
+    scene, truth = straight_into_a_clamp(tmp_path, 0.0, "[0, 0, '-travel']")
+    monkeypatch.setitem(sys.modules, "ipctk", None)
+    force = Reaction(scene, Driven.of(scene, truth.position), law_of(scene), ContactForces(scene, 0.05, 0.0))
+    stored = truth.fields["reaction"].values[-1, scene.body == 1].sum(axis=0)
+    away = np.linalg.norm(force.of(truth.position[-1]) - stored) / np.linalg.norm(stored)
+    assert 1e-3 < away < 5e-3 and force.without_edges
+
+
+def test_edges_that_cross_beside_held_nodes(tmp_path):
+    """A rigid bar across a bar that is held at one end: no node of either is near a face of the other."""
+    spec = write_assembly(tmp_path, SPEC.replace('fixed = "zmin"', 'fixed = "xmin"'))
+    write_box(tmp_path / "block.vtu", (0, 4, 0), (10, 6, 2), (4, 1, 1))
+    write_box(tmp_path / "punch.vtu", (0.5, 0, 2.2), (2, 10, 4), (1, 4, 1))
+    case = case_of(spec, travel=0.5)
+    scene, truth = case.scene, assembly.solve(case)
+    driven = Driven.of(scene, truth.position)
+    force, strains = (Reaction(scene, driven, law_of(scene), one) for one in (case.contact_forces(), None))
+    for position, nodal in zip(truth.position[1:], truth.fields["reaction"].values[1:], strict=True):
+        stored = nodal[driven.nodes].sum(axis=0)
+        np.testing.assert_allclose(force.of(position), stored, atol=1e-3 * np.linalg.norm(stored))
+        assert np.linalg.norm(strains.of(position) - stored) > 0.3 * np.linalg.norm(stored)
 
 
 def test_a_face_whose_nodes_are_all_held_shows_no_force(tmp_path):
@@ -162,26 +197,13 @@ def test_a_fine_tool_on_a_coarse_part(tmp_path, known):
     spec = write_assembly(tmp_path, SPEC)
     write_box(tmp_path / "block.vtu", (0, 0, 0), (10, 10, 5), (2, 2, 1))
     write_box(tmp_path / "punch.vtu", (1.5, 1, 5.2), (4, 3, 8), (8, 8, 6))
-    read = read_spec(spec)
-    case = assembly.scene_of(read, completed(read.parameters, {"travel": 0.6}), None, read.frames).case
+    case = case_of(spec, travel=0.6)
     scene, truth = case.scene, assembly.solve(case)
     driven = Driven.of(scene, truth.position)
     force = Reaction(scene, driven, law_of(scene), case.contact_forces() if known else None)
     for position, nodal in zip(truth.position[1:], truth.fields["reaction"].values[1:], strict=True):
         stored = nodal[driven.nodes].sum(axis=0)
         np.testing.assert_allclose(force.of(position), stored, atol=1e-3 * np.linalg.norm(stored))
-
-
-def test_corners_of_a_touched_face_count_though_they_are_far(tmp_path, monkeypatch):
-    """As above; here nothing at all is within reach, and contact alone says what is touched."""
-    monkeypatch.setattr(reaction, "REACH", 0.0)
-    scene, truth = solved(tmp_path, travel=0.5)
-    driven = Driven.of(scene, truth.position)
-    stored = truth.fields["reaction"].values[-1, driven.nodes].sum(axis=0)
-    contact = ContactForces(scene, 0.05, 0.0)
-    found = Reaction(scene, driven, law_of(scene), contact).of(truth.position[-1])
-    np.testing.assert_allclose(found, stored, atol=1e-3 * np.linalg.norm(stored))
-    assert not Reaction(scene, driven, law_of(scene)).of(truth.position[-1]).any()
 
 
 def test_it_is_the_force_on_the_body_that_moves_farthest_in_all_frames(tmp_path):

@@ -93,7 +93,7 @@ class NearSurfaces:
         columns = self._number[3 * of_pair[:, :, None] + np.arange(3)]  # [P, 4, 3]
         movable = (columns >= 0).any(axis=(1, 2))
         of_pair, columns, weight, normals = of_pair[movable], columns[movable], weight[movable], normals[movable]
-        tangents = _tangents(normals)
+        tangents = tangents_of(normals)
         axes = np.concatenate([normals, *tangents])
         rows = np.arange(3 * len(normals))
         values = np.tile(weight, (3, 1))[:, :, None] * axes[:, None, :]
@@ -107,7 +107,7 @@ class NearSurfaces:
         return NearPairs(directions, gaps[movable], slip)
 
 
-def _tangents(normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def tangents_of(normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Two unit vectors [P, 3] that are perpendicular to each of the normals [P, 3] and to each other."""
     across = np.eye(3)[np.abs(normals).argmin(axis=1)]
     first = np.cross(normals, across)

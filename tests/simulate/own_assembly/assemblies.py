@@ -5,6 +5,10 @@ from pathlib import Path
 import meshio
 import numpy as np
 
+from ast_sim.mechanics.case import SolidCase
+from ast_sim.simulate.families import assembly
+from ast_sim.simulate.own_assembly.parameters import completed
+from ast_sim.simulate.own_assembly.spec_reader import read_spec
 from ast_sim.simulate.shapes.parts import rectilinear
 
 SPEC = """
@@ -70,3 +74,9 @@ def write_assembly(folder: Path, spec: str = SPEC, scale: float = 1.0, shift=(0.
     path = folder / "SPEC.toml"
     path.write_text(spec)
     return path
+
+
+def case_of(path: Path, **given) -> SolidCase:
+    """What is solved for a specification with these parameters."""
+    spec = read_spec(path)
+    return assembly.scene_of(spec, completed(spec.parameters, given), None, spec.frames).case
