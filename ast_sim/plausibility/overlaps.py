@@ -11,6 +11,7 @@ from ast_sim.element_topology import triangle_sides
 from ast_sim.number_arrays import point
 from ast_sim.plausibility.findings import Finding
 from ast_sim.scene import Scene
+from ast_sim.support.nearest_surface import near_boxes
 
 # Depths below this share of the mean edge of the surfaces are left to rounding and to the softness of contact.
 _TOLERATED = 0.02
@@ -115,20 +116,7 @@ def _cut(rest: np.ndarray, first: np.ndarray, second: np.ndarray, tolerated: flo
 
 def _near(edges: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Pairs of edges [e, 2, 3] and faces [f, 3, 3] whose boxes meet."""
-    from scipy.spatial import KDTree
-
-    low, high = faces.min(axis=(0, 1)), faces.max(axis=(0, 1))
-    close = np.flatnonzero(((edges.max(axis=1) >= low) & (edges.min(axis=1) <= high)).all(axis=1))
-    if not len(close):
-        return close, close
-    middle, centre = edges[close].mean(axis=1), faces.mean(axis=1)
-    reach = np.linalg.norm(edges[close] - middle[:, None], axis=2).max()
-    reach += np.linalg.norm(faces - centre[:, None], axis=2).max()
-    lists = KDTree(centre).query_ball_point(middle, reach)
-    edge = np.repeat(close, [len(one) for one in lists])
-    face = np.array([row for one in lists for row in one], np.int64)
-    meet = _meet((edges[edge].min(axis=1), edges[edge].max(axis=1)), (faces[face].min(axis=1), faces[face].max(axis=1)))
-    return edge[meet], face[meet]
+    return near_boxes(edges.min(axis=1), edges.max(axis=1), faces.min(axis=1), faces.max(axis=1), 0.0)
 
 
 def _meet(one: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.ndarray]) -> np.ndarray:

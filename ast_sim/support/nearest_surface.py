@@ -67,3 +67,27 @@ def beside(
         return np.zeros(low.shape[1], bool)
     least, most = low_others.min(axis=1) - distance, high_others.max(axis=1) + distance
     return ((high >= least[:, None]) & (low <= most[:, None])).all(axis=0)
+
+
+def near_boxes(
+    low: np.ndarray, high: np.ndarray, low_others: np.ndarray, high_others: np.ndarray, distance: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """The rows of pairs of boxes from low to high [A, 3] and of other ones [B, 3] that come as near as `distance`."""
+    from scipy.spatial import KDTree
+
+    none = np.zeros(0, np.int64)
+    if not len(low) or not len(low_others):
+        return none, none
+    mine = np.flatnonzero(beside(low.T, high.T, low_others.T, high_others.T, distance))
+    theirs = np.flatnonzero(beside(low_others.T, high_others.T, low.T, high.T, distance))
+    if not len(mine) or not len(theirs):
+        return none, none
+    sizes = (high - low)[mine], (high_others - low_others)[theirs]
+    # Boxes that are apart by the distance along each axis are farther apart by the root of three.
+    reach = sum(np.linalg.norm(size, axis=1).max() / 2 for size in sizes) + np.sqrt(3) * distance
+    tree = KDTree((low_others + high_others)[theirs] / 2)
+    lists = tree.query_ball_point((low + high)[mine] / 2, reach)
+    first = np.repeat(mine, [len(one) for one in lists])
+    second = theirs[np.concatenate([np.asarray(one, np.int64) for one in lists])]
+    meet = ((low[first] <= high_others[second] + distance) & (low_others[second] <= high[first] + distance)).all(axis=1)
+    return first[meet], second[meet]

@@ -64,8 +64,10 @@ def test_plates_have_the_reaction_of_the_solver(tmp_path, monkeypatch):
         answer = example_run("plates").predict(truth, effort=Effort(newton_steps=1), throw=False)
     answer = replace(answer, position=truth.position)  # after Newton steps the force is of the positions, not predicted
     forces = np.linalg.norm(answer.reaction(), axis=1)
-    np.testing.assert_allclose(forces, truth.attributes["reaction"], rtol=1e-3, atol=1e-3)
-    assert forces[1] > 1
+    # Young's modulus times an edge times the rounding of positions, 1e6 Pa x 0.05 m x 1e-8 m: 5e-4 N at each of some
+    # ten nodes near the tool.
+    np.testing.assert_allclose(forces, truth.attributes["reaction"], rtol=1e-3, atol=5e-3)
+    assert forces[1] > 100
     monkeypatch.setattr(Reaction, "unseen", property(lambda _: True, lambda *_: None), raising=False)
     with pytest.warns(UserWarning, match="body 1 touches held nodes where no free node shows how hard"):
         answer.reaction()

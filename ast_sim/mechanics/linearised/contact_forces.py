@@ -78,9 +78,9 @@ class ContactForces:
 
     def pairs(self, position: np.ndarray) -> TouchingPairs:
         """The pairs within the range of contact at positions [N, 3]."""
-        near = self._near.pairs(position)
-        if self.barrier_pairs and not (near.gap < 0).any():
+        if self.barrier_pairs and not self.barrier_pairs.overlap(position):
             return self.barrier_pairs.at(position)
+        near = self._near.pairs(position)
         touching = np.flatnonzero(near.gap <= self._range)
         return TouchingPairs(*(near.directions[touching + axis * len(near.gap)] for axis in range(3)))
 
@@ -135,6 +135,10 @@ class _BarrierPairs:
         self._contact = Contact(rest, surface, scene.body, settings, ~scene.deforming_nodes)
         local = np.unique(surface, return_inverse=True)[1].reshape(-1, 3).astype(np.int32)
         self._edges_and_faces = load_ipctk().edges(local), local
+
+    def overlap(self, position: np.ndarray) -> bool:
+        """Whether bodies overlap at positions [N, 3]."""
+        return self._contact.intersects(position)
 
     def at(self, position: np.ndarray) -> TouchingPairs:
         """The pairs at positions [N, 3]. The barrier takes some off again, so that none counts twice: these pull."""

@@ -1,7 +1,8 @@
 """Newton steps with linearised contact: from nearly right positions to equilibrium in a few steps.
 
 At positions x, with K the stiffness, f the derivative of the elastic energy, and each near pair of a surface node and
-a triangle of another body with its gap g and its outward normal n, a step finds the displacement u of the free nodes:
+a triangle of another body, or of two edges, with its gap g and its outward normal n, a step finds the displacement u of
+the free nodes:
 
     minimise  1/2 u K u + f u   subject to   C u + g >= clearance,
 
@@ -17,8 +18,7 @@ slip from where the surfaces stuck to each other. A single step does not know th
 given, its surfaces have slid along the last fiftieth of a straight path from rest: surfaces that slide get the whole
 friction against their motion, and surfaces that stick hardly feel it (docs/log.md, 2026-11-25). Bodies may overlap at
 x, and elements may be turned over: these get the forces and the stiffness of the nearest upright shape (Irving, Teran
-and Fedkiw 2004). Pairs of edges are left out, so edges may cross by a little. A node is on the side of a surface where
-it is nearest: the start must be nearly right.
+and Fedkiw 2004). A node is on the side of a surface where it is nearest: the start must be nearly right.
 """
 
 from __future__ import annotations

@@ -1,29 +1,34 @@
-"""Pairs of a surface node and its nearest place on another body: how their gaps and slips follow the positions."""
+"""Pairs of a surface node and its nearest place on another body, and of edges that pass each other: how their gaps and
+slips follow the positions."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 import scipy.sparse
 
+from ast_sim.mechanics.linearised.near_edges import Passing, SurfaceEdges, passing
 from ast_sim.scene import Scene
 from ast_sim.support.nearest_surface import nearest_surface
 
 NEAR = 0.5  # pairs with a gap below this may touch, in mean edge lengths of the surfaces
 DEEP = 2.0  # a node deeper inside another body than this is not taken for one in contact with it, in the same
+DEEP_EDGES = 0.2  # the same of two edges: farther in it is not known which side they are on
 SLID = 0.02  # surfaces have slid along this last part of the path from rest to x, if nothing else is known
 
 
 @dataclass(frozen=True, eq=False)
 class NearPairs:
-    """Surface nodes near triangles of other bodies.
+    """Surface nodes near triangles of other bodies, and edges near edges.
 
     Attributes:
         directions: [3 P, F] sparse, the derivatives by F dofs of each pair's gap, then of its slip along one tangent,
             then along the other.
-        gap: [P], negative where the node lies inside the other body.
-        slip: [2 P], how far the node has slid along one tangent, then along the other.
+        gap: [P], negative where the bodies overlap.
+        slip: [2 P], how far each pair has slid along one tangent, then along the other.
     """
 
     directions: scipy.sparse.csr_array
@@ -51,58 +56,57 @@ class NearSurfaces:
         soft = faces[scene.deforming_nodes[faces[:, 0]]]
         self.length = float(np.linalg.norm(self._rest[soft[:, 0]] - self._rest[soft[:, 1]], axis=1).mean())
         nodes = np.unique(faces)
-        self._surfaces = [(faces[owner == body], nodes[scene.body[nodes] != body]) for body in np.unique(owner)]
+        bodies = np.unique(owner)
+        self._surfaces = [(faces[owner == body], nodes[scene.body[nodes] != body]) for body in bodies]
+        edges = {int(body): SurfaceEdges(faces[owner == body]) for body in bodies}
+        rigid = scene.rigid_bodies
+        self._edges = [(edges[a], edges[b]) for a, b in combinations(edges, 2) if not rigid >= {a, b}]
 
     def pairs(self, position: np.ndarray, stuck: np.ndarray | None = None) -> NearPairs:
-        """The pairs that may touch at `position` [N, 3]: a surface node and its nearest point of another body. They
-        have slid from where they were at `stuck` [N, 3]; if it is None, as `SLID` says."""
+        """The pairs that may touch at `position` [N, 3]. They have slid from where they were at `stuck` [N, 3]; if it
+        is None, as `SLID` says."""
+        parts = [*self._nodes_and_faces(position), *self._edges_and_edges(position)]
+        if not parts:
+            return NearPairs(scipy.sparse.csr_array((0, self._count)), np.zeros(0), np.zeros(0))
+        slid = SLID * (position - self._rest) if stuck is None else position - stuck
+        return self._pairs(*(np.concatenate(values) for values in zip(*parts, strict=True)), slid=slid)
+
+    def _nodes_and_faces(self, position: np.ndarray) -> Iterator[Passing]:
+        """The pairs of a node and its nearest place on another body."""
         import igl  # takes 0.2 s
 
-        nodes, corners, normals, shares, gaps = [], [], [], [], []
         for faces, others in self._surfaces:
-            nearest = nearest_surface(
-                position[others], position, faces, inside=DEEP * self.length, outside=NEAR * self.length
-            )
+            inside, outside = DEEP * self.length, NEAR * self.length
+            nearest = nearest_surface(position[others], position, faces, inside=inside, outside=outside)
             if not len(nearest.rows):
                 continue
-            corner_positions = (position[nearest.triangles[:, i]] for i in range(3))
-            nodes.append(others[nearest.rows])
-            corners.append(nearest.triangles)
-            normals.append(nearest.normal)
-            shares.append(igl.barycentric_coordinates(nearest.place, *corner_positions))
-            gaps.append(nearest.gap)
-        if not gaps:
-            return NearPairs(scipy.sparse.csr_array((0, self._count)), np.zeros(0), np.zeros(0))
-        joined = (np.concatenate(parts) for parts in (nodes, corners, normals, shares, gaps))
-        slid = SLID * (position - self._rest) if stuck is None else position - stuck
-        return self._pairs(*joined, slid=slid)
+            corners = (position[nearest.triangles[:, i]] for i in range(3))
+            shares = -np.asarray(igl.barycentric_coordinates(nearest.place, *corners))
+            nodes = np.concatenate([others[nearest.rows, None], nearest.triangles], axis=1)
+            yield Passing(nodes, np.insert(shares, 0, 1, axis=1), nearest.normal, nearest.gap)
+
+    def _edges_and_edges(self, position: np.ndarray) -> Iterator[Passing]:
+        """The pairs of edges that pass each other."""
+        for one, other in self._edges:
+            yield passing(one.at(position), other.at(position), DEEP_EDGES * self.length, NEAR * self.length)
 
     def _pairs(
-        self,
-        nodes: np.ndarray,
-        corners: np.ndarray,
-        normals: np.ndarray,
-        shares: np.ndarray,
-        gaps: np.ndarray,
-        slid: np.ndarray,
+        self, nodes: np.ndarray, shares: np.ndarray, normals: np.ndarray, gaps: np.ndarray, slid: np.ndarray
     ) -> NearPairs:
-        """Pairs of nodes [P] and triangles [P, 3] with their normals, barycentric coordinates [P, 3] and gaps [P]; the
+        """Pairs of four nodes [P, 4] with their shares [P, 4] in the distance, their normals [P, 3] and gaps [P]; the
         nodes have moved by `slid` [N, 3] since the pairs stuck."""
-        of_pair = np.concatenate([nodes[:, None], corners], axis=1)  # [P, 4]
-        weight = np.concatenate([np.ones((len(nodes), 1)), -shares], axis=1)
-        columns = self._number[3 * of_pair[:, :, None] + np.arange(3)]  # [P, 4, 3]
+        columns = self._number[3 * nodes[:, :, None] + np.arange(3)]  # [P, 4, 3]
         movable = (columns >= 0).any(axis=(1, 2))
-        of_pair, columns, weight, normals = of_pair[movable], columns[movable], weight[movable], normals[movable]
+        nodes, columns, shares, normals = nodes[movable], columns[movable], shares[movable], normals[movable]
         tangents = tangents_of(normals)
         axes = np.concatenate([normals, *tangents])
-        rows = np.arange(3 * len(normals))
-        values = np.tile(weight, (3, 1))[:, :, None] * axes[:, None, :]
+        values = np.tile(shares, (3, 1))[:, :, None] * axes[:, None, :]
         columns = np.tile(columns, (3, 1, 1))
+        rows = np.broadcast_to(np.arange(len(axes))[:, None, None], columns.shape)
         free = columns >= 0
-        rows = np.broadcast_to(rows[:, None, None], columns.shape)
         entries = values[free], (rows[free], columns[free])
         directions = scipy.sparse.csr_array(entries, shape=(len(axes), self._count))
-        relative = np.einsum("pk,pki->pi", weight, slid[of_pair])
+        relative = np.einsum("pk,pki->pi", shares, slid[nodes])
         slip = np.concatenate([np.einsum("pi,pi->p", relative, tangent) for tangent in tangents])
         return NearPairs(directions, gaps[movable], slip)
 
