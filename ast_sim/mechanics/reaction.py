@@ -45,8 +45,8 @@ class Reaction:
     Attributes:
         unseen: whether in some positions contact went straight into held nodes and no free node shows how hard. These
             forces are missing.
-        without_edges: whether in some positions another body is near held nodes, and pairs of edges were left out,
-            because ipctk is not installed. The force is rough.
+        rough: whether in some positions another body is near held nodes, and not all pairs that touch are known,
+            because ipctk is not installed.
     """
 
     def __init__(self, scene: Scene, driven: Driven, law: NeoHookean, contact: ContactForces | None = None) -> None:
@@ -55,7 +55,7 @@ class Reaction:
         self.scene = scene
         self.driven = driven
         self._contact = contact
-        self.unseen = self.without_edges = False
+        self.unseen = self.rough = False
         self._rest = scene.rest_position.astype(np.float64)
         soft = np.flatnonzero(~scene.rigid_elements)
         self._elasticity = elastic_body(self._rest, scene.elements[soft], law.of(soft))
@@ -98,7 +98,7 @@ class Reaction:
     def _straight(self, contact: ContactForces, position: np.ndarray, forces: np.ndarray) -> np.ndarray:
         """[N,3] the forces of contact between the driven body and held nodes, where elastic `forces` [N,3] show them; 0
         elsewhere, and on positions that are no equilibrium."""
-        self.without_edges |= contact.barrier_pairs is None
+        self.rough |= contact.barrier_pairs is None
         pairs = contact.pairs(position)
         of_body = self.scene.body == self.driven.body
         pushes_others = self.driven.body in self.scene.rigid_bodies

@@ -150,7 +150,7 @@ def test_what_goes_straight_into_held_nodes_counts(tmp_path, friction, motion, t
             away = np.linalg.norm(force.of(position) - stored)
             assert away < tolerance * np.linalg.norm(stored)
             assert np.linalg.norm(strains.of(position) - stored) > 0.5 * np.linalg.norm(stored)
-        assert not force.without_edges
+        assert not force.rough
     shaken = truth.position[-1] + np.random.default_rng(0).normal(0, 0.05, truth.position[-1].shape)
     shaken[scene.prescribed] = truth.position[-1][scene.prescribed]
     np.testing.assert_array_equal(force.shares(shaken), strains.shares(shaken))  # forces of no equilibrium show nothing
@@ -163,7 +163,7 @@ def test_without_ipctk_pairs_of_edges_are_missing(tmp_path, monkeypatch):
     force = Reaction(scene, Driven.of(scene, truth.position), law_of(scene), ContactForces(scene, 0.05, 0.0))
     stored = truth.fields["reaction"].values[-1, scene.body == 1].sum(axis=0)
     away = np.linalg.norm(force.of(truth.position[-1]) - stored) / np.linalg.norm(stored)
-    assert 1e-3 < away < 5e-3 and force.without_edges
+    assert 1e-3 < away < 5e-3 and force.rough
 
 
 def test_edges_that_cross_beside_held_nodes(tmp_path):

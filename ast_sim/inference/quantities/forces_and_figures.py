@@ -149,10 +149,10 @@ def _newton(answer: Answer, driven: Driven) -> np.ndarray:
             " straight into them strains nothing, and is missing in its force: a model that predicts reactions"
             " (state=['reaction'], --state reaction) has it"
         )
-    if reaction.without_edges:
+    if reaction.rough:
         warn(
-            f"{answer.name}: body {driven.body} has contact near held nodes. Its force may be a fifth off, because"
-            ' ipctk is not installed, which finds where edges touch: pip install "ast_sim[simulate]"'
+            f"{answer.name}: body {driven.body} has contact near held nodes. Its force may be a tenth off, because"
+            ' ipctk is not installed, which finds all that touches: pip install "ast_sim[simulate]"'
         )
     return LENGTH_UNITS[answer.info.length_unit] ** 2 * np.array(shares).reshape(-1, answer.scene.num_nodes, 3)
 

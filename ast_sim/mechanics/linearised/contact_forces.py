@@ -9,8 +9,8 @@ that carry a force, and of each pair the one along what is left of f.
 A pair that hardly moves free nodes could carry any force. So of all forces that leave no more of f than that, about the
 smallest are taken: the sum of their squares counts, times the square of the share of f that is left (Tikhonov).
 
-Where nothing overlaps, the pairs are the ones of the solver's barriers, of edges, too; ipctk finds them. A distance
-knows no sides: of bodies that overlap, and where ipctk is not installed, pairs of nodes and faces are all.
+Where nothing overlaps, the pairs are the ones of the solver's barriers, which ipctk finds. A distance knows no sides:
+of bodies that overlap, and where ipctk is not installed, the pairs of Newton steps are taken (`near_pairs`).
 """
 
 from __future__ import annotations

@@ -38,12 +38,12 @@ class PlacedEdges(NamedTuple):
         return PlacedEdges(*(values[rows] for values in self))
 
 
-class Passing(NamedTuple):
-    """Pairs of edges that pass each other.
+class NearPlaces(NamedTuple):
+    """Pairs of near places: on two edges, or at a node and on a triangle.
 
     Attributes:
-        nodes: [P, 4], two of an edge of the first surface, and two of the second.
-        shares: [P, 4] of these nodes in the distance: of the first edge they add up to 1, of the second to -1.
+        nodes: [P, 4], two of each edge; or the node and the corners.
+        shares: [P, 4] of these nodes in the distance: on the first surface they add up to 1, on the second to -1.
         normal: [P, 3], from the second surface to the first.
         gap: [P], negative where the surfaces overlap.
     """
@@ -74,7 +74,7 @@ class SurfaceEdges:
         return PlacedEdges(self._nodes, position[self._nodes], outward, bend < SHARP)
 
 
-def passing(one: PlacedEdges, other: PlacedEdges, inside: float, outside: float) -> Passing:
+def passing(one: PlacedEdges, other: PlacedEdges, inside: float, outside: float) -> NearPlaces:
     """The pairs of edges of two surfaces, one of them sharp, with a gap between -inside and outside."""
     first, second = _near(one, other, max(inside, outside))
     d = first.ends[:, 1] - first.ends[:, 0]
@@ -90,7 +90,7 @@ def passing(one: PlacedEdges, other: PlacedEdges, inside: float, outside: float)
     facing = np.minimum(np.einsum("pi,pi->p", second.outward, normal), -np.einsum("pi,pi->p", first.outward, normal))
     near = (s > 0) & (s < 1) & (t > 0) & (t < 1) & (gap < outside) & (gap > -inside) & (facing > FACING)
     shares = np.stack([1 - s, s, t - 1, -t], axis=1)
-    return Passing(np.concatenate([first.nodes, second.nodes], axis=1)[near], shares[near], normal[near], gap[near])
+    return NearPlaces(np.concatenate([first.nodes, second.nodes], axis=1)[near], shares[near], normal[near], gap[near])
 
 
 def _near(one: PlacedEdges, other: PlacedEdges, distance: float) -> tuple[PlacedEdges, PlacedEdges]:

@@ -10,7 +10,7 @@ from itertools import combinations
 import numpy as np
 import scipy.sparse
 
-from ast_sim.mechanics.linearised.near_edges import Passing, SurfaceEdges, passing
+from ast_sim.mechanics.linearised.near_edges import NearPlaces, SurfaceEdges, passing
 from ast_sim.scene import Scene
 from ast_sim.support.nearest_surface import nearest_surface
 
@@ -58,9 +58,8 @@ class NearSurfaces:
         nodes = np.unique(faces)
         bodies = np.unique(owner)
         self._surfaces = [(faces[owner == body], nodes[scene.body[nodes] != body]) for body in bodies]
-        edges = {int(body): SurfaceEdges(faces[owner == body]) for body in bodies}
-        rigid = scene.rigid_bodies
-        self._edges = [(edges[a], edges[b]) for a, b in combinations(edges, 2) if not rigid >= {a, b}]
+        self._edges = {int(body): SurfaceEdges(faces[owner == body]) for body in bodies}
+        self._may_touch = [pair for pair in combinations(self._edges, 2) if not scene.rigid_bodies.issuperset(pair)]
 
     def pairs(self, position: np.ndarray, stuck: np.ndarray | None = None) -> NearPairs:
         """The pairs that may touch at `position` [N, 3]. They have slid from where they were at `stuck` [N, 3]; if it
@@ -71,7 +70,7 @@ class NearSurfaces:
         slid = SLID * (position - self._rest) if stuck is None else position - stuck
         return self._pairs(*(np.concatenate(values) for values in zip(*parts, strict=True)), slid=slid)
 
-    def _nodes_and_faces(self, position: np.ndarray) -> Iterator[Passing]:
+    def _nodes_and_faces(self, position: np.ndarray) -> Iterator[NearPlaces]:
         """The pairs of a node and its nearest place on another body."""
         import igl  # takes 0.2 s
 
@@ -83,12 +82,13 @@ class NearSurfaces:
             corners = (position[nearest.triangles[:, i]] for i in range(3))
             shares = -np.asarray(igl.barycentric_coordinates(nearest.place, *corners))
             nodes = np.concatenate([others[nearest.rows, None], nearest.triangles], axis=1)
-            yield Passing(nodes, np.insert(shares, 0, 1, axis=1), nearest.normal, nearest.gap)
+            yield NearPlaces(nodes, np.insert(shares, 0, 1, axis=1), nearest.normal, nearest.gap)
 
-    def _edges_and_edges(self, position: np.ndarray) -> Iterator[Passing]:
+    def _edges_and_edges(self, position: np.ndarray) -> Iterator[NearPlaces]:
         """The pairs of edges that pass each other."""
-        for one, other in self._edges:
-            yield passing(one.at(position), other.at(position), DEEP_EDGES * self.length, NEAR * self.length)
+        edges = {body: edges.at(position) for body, edges in self._edges.items()}
+        for one, other in self._may_touch:
+            yield passing(edges[one], edges[other], DEEP_EDGES * self.length, NEAR * self.length)
 
     def _pairs(
         self, nodes: np.ndarray, shares: np.ndarray, normals: np.ndarray, gaps: np.ndarray, slid: np.ndarray
