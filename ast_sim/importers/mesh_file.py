@@ -226,11 +226,11 @@ def read_mesh(
 ) -> MeshFile:
     """The tetrahedra of a file or of a meshio mesh; its triangles if it has no cells with a volume.
 
-    Hexahedra, prisms and pyramids are cut into tetrahedra. Tetrahedra of ten nodes keep them, and then all others get
-    nodes in the middles of their edges; with `corners`, and in other elements of higher order, the corners only are
-    taken. Triangles and quadrilaterals that touch no tetrahedron are shells. All other cells of a lower dimension are
-    left out. Of a file with several frames the first is taken. `path` names a mesh in memory in errors. Points at one
-    place are not joined where one of the `used_fields` says that they are not alike.
+    Hexahedra, prisms and pyramids are cut into tetrahedra, quadrilaterals into triangles. Tetrahedra of ten nodes keep
+    them, and then all others get nodes in the middles of their edges; with `corners`, and in other elements of higher
+    order, the corners only are taken. Triangles and quadrilaterals that touch no tetrahedron are shells. All other
+    cells of a lower dimension are left out. Of a file with several frames the first is taken. `path` names a mesh in
+    memory in errors. Points at one place are not joined where one of the `used_fields` says that they are not alike.
 
     Raises:
         DatasetError: the file is missing, damaged or of an unknown kind, or holds other elements; the text names it.

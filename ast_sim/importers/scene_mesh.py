@@ -57,10 +57,11 @@ def read_scene(
 ) -> SceneMesh:
     """The scene of a mesh: a file of any known format, or a mesh in memory.
 
-    The elements are the tetrahedra; hexahedra, prisms and pyramids are cut into them; the triangles if there is none of
-    all these. Triangles and quadrilaterals beside tetrahedra that touch none are rigid shells: they become obstacles,
-    thin layers of tetrahedra whose front is the shell. Points that belong to no element are left out. Tetrahedra that
-    are inside out are turned over, and points that stand several times are joined.
+    The elements are the tetrahedra; hexahedra, prisms and pyramids are cut into them. If there is none of all these,
+    the elements are the triangles, and quadrilaterals are cut into them. Triangles and quadrilaterals beside tetrahedra
+    that touch none are rigid shells: they become obstacles, thin layers of tetrahedra whose front is the shell. Points
+    that belong to no element are left out. Tetrahedra that are inside out are turned over, and points that stand
+    several times are joined.
 
     Args:
         obstacles: numbers of the bodies that are rigid and move as prescribed.

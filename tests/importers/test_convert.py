@@ -406,9 +406,9 @@ def test_a_wrong_frame_is_named(tmp_path, case, capfd):
         (frame(point={"b": np.full(8, 0.5)}), {"body": "b"}, "b at node 0 is 0.5; must be a whole number"),
         (frame(), {"material": ("E",)}, "there is no cell field 'E'"),
         (
-            frame(elements=np.array([[0, 1, 2]]), extra=[("quad", np.arange(4)[None])]),
+            lambda path: meshio.write(path, meshio.Mesh(np.eye(3), [("line", [[0, 1]])])),
             {},
-            "holds triangle, quad; the elements must be tetrahedra, hexahedra, prisms or pyramids, or triangles alone",
+            "holds line; the elements must be tetrahedra, hexahedra, prisms or pyramids, or triangles and",
         ),
         (frame(elements=np.array([[0, 1, 1, 2]])), {}, "element 0 refers to a node twice"),
     ],

@@ -260,11 +260,6 @@ WRONG = {
         {},
         "mesh: element 0 .* has no volume; 6 of 6",
     ),
-    "quadrilaterals": (
-        meshio.Mesh(POINTS, {"quad": np.arange(4)[None], "triangle": np.arange(3)[None]}),
-        {},
-        "mesh: holds quad, triangle; the elements must be tetrahedra, hexahedra, prisms or pyramids, or triangles",
-    ),
     "lines": (meshio.Mesh(POINTS, {"line": np.arange(2)[None]}), {}, "holds line; the elements must be"),
     "points": (meshio.Mesh(POINTS, []), {}, "holds no cells; the elements must be"),
     "material of no body": (MESH, {**PRESCRIBED, "materials": {0: 1, 2: 1}}, "there is no body 2"),

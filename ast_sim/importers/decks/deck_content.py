@@ -15,15 +15,16 @@ from typing import NamedTuple
 import numpy as np
 
 from ast_sim.importers.decks.comment_lines import is_keyword, require_keyword
-from ast_sim.importers.decks.deck_numbers import elements_of, nodes_of, real, tokens, whole
-from ast_sim.importers.decks.element_types import kind_of
+from ast_sim.importers.decks.deck_axes import from_angles, placement_of, system_of
+from ast_sim.importers.decks.deck_numbers import elements_of, nodes_in, nodes_of, tokens, whole
+from ast_sim.importers.decks.element_types import is_users_own, kind_of
 from ast_sim.importers.decks.keyword_lines import Keyword, read_keywords
 from ast_sim.importers.formats.source_mesh import node_count
 from ast_sim.support.errors import DatasetError
 
 # Keywords that make, move or remove nodes or elements, and that are not understood here.
 _CHANGE_THE_MESH = {
-    *("NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "IMPORT", "PARAMETER", "IMPERFECTION", "REFINEMESH"),
+    *("NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "IMPORT", "IMPERFECTION", "REFINEMESH"),
     *("SYMMETRICMODELGENERATION", "SYMMETRICRESULTSTRANSFER", "PARAMETERSHAPEVARIATION", "PARAMETERDEPENDENCE"),
     *("ADAPTIVEMESH", "MESHREFINEMENT", "NODALTRANSLATION", "IMPORTNSET", "IMPORTELSET"),
 }
@@ -39,6 +40,9 @@ _OPTIONS = {
     "SYSTEM": set(),
     **dict.fromkeys(("ENDPART", "ENDASSEMBLY", "ENDINSTANCE"), set()),
 }
+
+# Surfaces of rigid tools that a formula describes: no element belongs to them.
+_FORMULAS = {"SEGMENTS", "CYLINDER", "REVOLUTION", "USER"}
 
 
 class Members(NamedTuple):
@@ -65,6 +69,15 @@ class ElementBlock:
     keyword: Keyword
 
 
+class UsersOwn(NamedTuple):
+    """Elements of a type whose shape is not known (*USER ELEMENT): how many, and the numbers [n] of all their nodes."""
+
+    type_name: str
+    how_many: int
+    nodes: np.ndarray
+    keyword: Keyword
+
+
 @dataclass(eq=False)
 class Content:
     """Nodes, elements and sets of the deck, of a part, of an instance or of the assembly. Names are in upper case."""
@@ -72,6 +85,7 @@ class Content:
     name: str = ""
     nodes: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)
     blocks: list[ElementBlock] = field(default_factory=list)
+    users_own: list[UsersOwn] = field(default_factory=list)
     node_sets: Sets = field(default_factory=dict)
     element_sets: Sets = field(default_factory=dict)
 
@@ -88,7 +102,8 @@ class Instance:
 
 @dataclass(eq=False)
 class Deck:
-    """A deck: all keywords in order, and what they say of the mesh. `written` has names as they were first written."""
+    """A deck: all keywords in order, and what they say of the mesh. `written` has names as they were first written;
+    `formulas` are the names of analytical rigid surfaces."""
 
     path: Path
     keywords: list[Keyword]
@@ -98,6 +113,7 @@ class Deck:
     written: dict[str, str] = field(default_factory=dict)
     ignored: Counter[str] = field(default_factory=Counter)
     left_out: Counter[str] = field(default_factory=Counter)
+    formulas: list[str] = field(default_factory=list)
 
 
 def read_deck(path: Path) -> Deck:
@@ -145,7 +161,13 @@ class _Reader:
             if unknown:
                 raise keyword.error(f"the option {min(unknown)} is not understood here")
             self.handlers[name](keyword)
-        elif len(name) > 2 and any(known.startswith(name) for known in (*_OPTIONS, *_CHANGE_THE_MESH)):
+        elif name == "END" and not keyword.data and self.content is self.deck.root:
+            pass  # some programs write it as the last line
+        elif (
+            len(name) > 2
+            and not is_keyword(name)
+            and any(one.startswith(name) for one in (*_OPTIONS, *_CHANGE_THE_MESH))
+        ):
             raise keyword.error("is this a short form? Write the whole keyword")
         else:
             self._ignore(keyword)
@@ -158,6 +180,9 @@ class _Reader:
         require_keyword(keyword, self.before, _OPTIONS, sets)
         if keyword.name:
             self.deck.ignored[keyword.name] += 1
+        of_formula = keyword.name == "SURFACE" and keyword.options.get("TYPE", "").replace(" ", "").upper() in _FORMULAS
+        if of_formula or keyword.name == "RIGIDSURFACE":
+            self.deck.formulas.append(keyword.options.get("NAME", f"of line {keyword.line.number}"))
 
     def _key(self, name: str) -> str:
         key = name.upper()
@@ -173,7 +198,7 @@ class _Reader:
         if kind not in ("R", "C", "S"):
             raise keyword.error(f"SYSTEM={kind} is not known; must be R, C or S")
         if kind != "R":
-            points = _from_angles(points, kind == "S")
+            points = from_angles(points, kind == "S")
         if self.system is not None:
             points = points @ self.system[:3] + self.system[3]
         self.content.nodes.append((numbers, points))
@@ -183,9 +208,14 @@ class _Reader:
     def _element(self, keyword: Keyword) -> None:
         type_name = keyword.required("TYPE").upper()
         kind = kind_of(type_name)
+        name = keyword.options.get("ELSET")
+        if kind is None and is_users_own(type_name):
+            self.content.users_own.append(UsersOwn(type_name, *nodes_in(keyword), keyword))
+            if name:
+                self.content.element_sets.setdefault(self._key(name), [])
+            return
         if kind is None:
             raise keyword.error(f"elements of the type {type_name} are not known here")
-        name = keyword.options.get("ELSET")
         if not kind:
             self.deck.left_out[type_name] += len(keyword.data)
             if name:
@@ -246,25 +276,7 @@ class _Reader:
         raise keyword.error(f"there is no set of {kind} {text!r} before this line")
 
     def _system(self, keyword: Keyword) -> None:
-        """An origin, a point on the x axis and one in the plane of x and y. The origin alone: the axes stay; without
-        the third point z stays, and the x axis is projected onto the plane of x and y."""
-        values = [real(text, line) for line in keyword.data for text in (*tokens(line), *[""] * 6)[:6]]
-        if not values:
-            self.system = None
-            return
-        if len(values) > 12:
-            raise keyword.error("has more than two data lines")
-        origin = np.array(values[:3])
-        alone = len(values) == 6 and len(tokens(keyword.data[0])) <= 3
-        x = np.array([1.0, 0, 0]) if alone else np.array(values[3:6]) - origin
-        if len(values) == 6:
-            x[2] = 0
-        z = np.cross(x, np.array(values[6:9]) - origin) if len(values) > 6 else np.array([0.0, 0, 1])
-        axes = np.stack([x, np.cross(z, x), z])
-        lengths = np.linalg.norm(axes, axis=1, keepdims=True)
-        if not (lengths > 0).all():
-            raise keyword.error("its points lie on a line")
-        self.system = np.concatenate([axes / lengths, origin[None]])
+        self.system = system_of(keyword)
 
     def _part(self, keyword: Keyword) -> None:
         name = self._key(keyword.required("NAME"))
@@ -280,7 +292,7 @@ class _Reader:
             raise keyword.error(f"there is no part {keyword.options['PART']!r} before this line")
         if name in self.deck.instances:
             raise keyword.error(f"there are two instances {keyword.options['NAME']!r}")
-        rotation, shift = _placement(keyword)
+        rotation, shift = placement_of(keyword)
         self.content = Content(name)
         self.deck.instances[name] = Instance(self.deck.parts[part], self.content, rotation, shift)
 
@@ -303,42 +315,3 @@ def _generated(keyword: Keyword) -> np.ndarray:
             raise DatasetError(f"{line.place}: cannot count from {first} to {last} in steps of {step}")
         parts.append(np.arange(first, last + 1, step))
     return np.concatenate(parts)
-
-
-def _from_angles(points: np.ndarray, spherical: bool) -> np.ndarray:
-    """Points of cylindrical (radius, angle, z) or spherical (radius, angle, angle from the plane) coordinates; angles
-    are in degrees."""
-    radius, angle, third = points.T
-    angle = np.radians(angle)
-    flat = radius * np.cos(np.radians(third)) if spherical else radius
-    height = radius * np.sin(np.radians(third)) if spherical else third
-    return np.stack([flat * np.cos(angle), flat * np.sin(angle), height], axis=1)
-
-
-def _placement(keyword: Keyword) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation and shift of an instance: it is first moved, then turned about the axis from one point to another."""
-    from scipy.spatial.transform import Rotation
-
-    rows = [[real(text, line) for text in (*tokens(line), *[""] * 7)[:7]] for line in keyword.data]
-    if len(rows) > 2:
-        raise keyword.error("has more than two data lines")
-    if rows and len(tokens(keyword.data[0])) > 3:  # an empty line for no shift is no data line here
-        raise DatasetError(
-            f"{keyword.data[0].place}: the first line of an instance is its shift, three numbers: write 0, 0, 0 before"
-            " the line of a rotation"
-        )
-    if len(rows) == 2 and len(tokens(keyword.data[1])) != 7:
-        raise DatasetError(
-            f"{keyword.data[1].place}: a rotation has two points of its axis and an angle, seven numbers"
-        )
-    shift = np.array(rows[0][:3]) if rows else np.zeros(3)
-    if len(rows) < 2:
-        return np.eye(3), shift
-    start = np.array(rows[1][:3])
-    end = np.array(rows[1][3:6])
-    angle = np.radians(rows[1][6])
-    length = np.linalg.norm(end - start)
-    if not length > 0:
-        raise keyword.error("the axis of the rotation has no length")
-    rotation = Rotation.from_rotvec(angle * (end - start) / length).as_matrix()
-    return rotation, rotation @ (shift - start) + start

@@ -90,11 +90,20 @@ class _Assembly:
     def mesh(self, understood: Collection[str]) -> SourceMesh:
         for name, scope in self.scopes.items():
             self._take_elements(name, scope)
+        for scope in self.scopes.values():
+            self._leave_out_users_own(scope)
         if not self.blocks:
             held = ", ".join(f"{count} {name}" for name, count in self.deck.left_out.items()) or "no elements"
+            if any(one.name == "RESTART" and "READ" in one.options for one in self.deck.keywords):
+                held += ", and continues another job (*RESTART, READ), whose deck has the mesh"
             raise DatasetError(f"{self.deck.path}: holds {held}: a scene needs elements of a volume")
         notes = [*self.notes]
         notes += [f"{count} elements of the type {name} are left out" for name, count in self.deck.left_out.items()]
+        if self.deck.formulas:
+            notes.append(
+                f"rigid surfaces without elements are left out: {', '.join(self.deck.formulas)}; a tool needs a mesh,"
+                " for example of R3D4"
+            )
         turned = sum(len(block.nodes) for block in self.blocks if block.label.startswith(REVOLVED))
         notes += (
             [f"{turned} elements are sections of a body of revolution: they are taken as a plane"] if turned else []
@@ -116,12 +125,34 @@ class _Assembly:
             numbers.append(block.numbers)
             nodes.extend(places)
         together = np.concatenate(numbers)
-        unique, first = np.unique(together, return_index=True)
-        if len(unique) < len(together):
-            twice = int(together[np.setdiff1d(np.arange(len(together)), first)[0]])
-            where = f" of {self.deck.written[name]}" if name else ""
-            raise DatasetError(f"{self.deck.path}: element {twice}{where} stands in the deck twice")
+        unique, first, which = np.unique(together, return_index=True, return_inverse=True)
+        for row in np.setdiff1d(np.arange(len(together)), first):
+            if not np.array_equal(nodes[row], nodes[first[which[row]]]):
+                where = f" of {self.deck.written[name]}" if name else ""
+                raise DatasetError(
+                    f"{self.deck.path}: element {together[row]}{where} stands in the deck twice, with different nodes"
+                )
         self.elements[name] = (unique, [nodes[row] for row in first])
+
+    def _leave_out_users_own(self, scope: _Scope) -> None:
+        """Leave out elements whose shape only the user knows, if others have all of their nodes: a mesh that is drawn
+        in their place, or the faces of bodies.
+
+        Raises:
+            DatasetError: some of their nodes belong to no other element.
+        """
+        for one in (one for content in scope.contents for one in content.users_own):
+            used = np.concatenate([np.zeros(0, np.int64), *(block.nodes.ravel() for block in self.blocks)])
+            places = scope.start + np.flatnonzero(np.isin(scope.numbers, one.nodes))
+            alone = len(one.nodes) - np.isin(places, used).sum()
+            if alone:
+                raise one.keyword.error(
+                    f"elements of the type {one.type_name} are the user's own, so their shape is not known, and {alone}"
+                    f" of their {len(one.nodes)} nodes belong to no other element: write them as C3D8, C3D4 or alike"
+                )
+            self.notes.append(
+                f"{one.how_many} elements of the user's own type {one.type_name} are left out: others have their nodes"
+            )
 
     def _places(self, scope: _Scope, block: ElementBlock) -> np.ndarray:
         """[c, k]: where the nodes of elements are in the mesh."""

@@ -95,6 +95,18 @@ def elements_of(keyword: Keyword, count: int) -> tuple[np.ndarray, list[list[str
     return np.array(numbers, np.int64), np.array(rows, np.int64).reshape(-1, count)
 
 
+def nodes_in(keyword: Keyword) -> tuple[int, np.ndarray]:
+    """How many elements a block has, and the numbers of all their nodes. How many nodes an element has is not known: it
+    goes on after a comma at the end of a line."""
+    count, nodes, goes_on = 0, [], False
+    for line in keyword.data:
+        numbers = [whole(text, line) for text in tokens(line)]
+        count += not goes_on
+        nodes += numbers if goes_on else numbers[1:]
+        goes_on = line.text.endswith(",")
+    return count, np.unique(np.array(nodes, np.int64))
+
+
 def _table(lines: Sequence[Line], columns: int, dtype: type) -> np.ndarray | None:
     """[lines, columns]: the lines as plain numbers; None if they are not all of this form."""
     if not lines:

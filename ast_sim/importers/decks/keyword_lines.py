@@ -102,6 +102,7 @@ def _options(line: Line, text: str) -> dict[str, str]:
     options: dict[str, str] = {}
     place = 0
     while text[place:].strip(" \t,"):
+        place += len(text[place:]) - len(text[place:].lstrip(" \t,"))  # nothing may stand between two commas
         option = _NAMED.match(text, place)
         if option is None:
             raise DatasetError(f"{line.place}: the options {text.strip()!r} cannot be read")

@@ -1,8 +1,8 @@
 """Which cells of a file become elements: tetrahedra of all cells with a volume, or triangles if there are none.
 
 This is the one place where cells of a higher order than the second, and curved hexahedra, prisms, pyramids and
-triangles, are reduced to their corners, where hexahedra, prisms and pyramids are cut into tetrahedra, where elements
-that stand twice are taken once, and where elements are turned over.
+triangles, are reduced to their corners, where hexahedra, prisms and pyramids are cut into tetrahedra and quadrilaterals
+into triangles, where elements that stand twice are taken once, and where elements are turned over.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 
 from ast_sim.importers.formats.source_mesh import SourceMesh
 from ast_sim.importers.solids.middles import NO_NODE, TURNED, middles_of, require_near
-from ast_sim.importers.solids.splitting import tetrahedra_of
+from ast_sim.importers.solids.splitting import tetrahedra_of, triangles_of
 from ast_sim.support.errors import DatasetError
 
 # A tetrahedron (triangle) is flat if its volume (area) is below this share of its longest edge to the power of 3 (2).
@@ -56,11 +56,11 @@ def elements_of(mesh: SourceMesh, point_of: np.ndarray, corners: bool = False) -
     """
     dimension = max((block.dimension for block in mesh.blocks), default=0)
     chosen = [index for index, block in enumerate(mesh.blocks) if block.dimension == dimension]
-    if dimension < 2 or (dimension == 2 and any(mesh.blocks[index].shape != "triangle" for index in chosen)):
+    if dimension < 2:
         held = ", ".join(mesh.counts()) or "no cells"
         raise DatasetError(
             f"{mesh.path}: holds {held}; the elements must be tetrahedra, hexahedra, prisms or pyramids, or triangles"
-            " alone: mesh the bodies with tetrahedra"
+            " and quadrilaterals alone: mesh the bodies with tetrahedra"
         )
     starts = np.cumsum([0, *(len(block.nodes) for block in mesh.blocks)])
     nodes, middles, rows, told = [], [], [], []
@@ -76,9 +76,10 @@ def elements_of(mesh: SourceMesh, point_of: np.ndarray, corners: bool = False) -
         if shape == "tetra":
             _require_proper(mesh, cells, row)
         elif shape != "triangle":
-            tetrahedra, owner = tetrahedra_of(shape, cells)
-            told.append(f"{len(cells)} cells of the kind {shape} are cut into {len(tetrahedra)} tetrahedra")
-            cells, middle, row = tetrahedra, middle[owner], row[owner]
+            cut, owner = triangles_of(cells) if shape == "quad" else tetrahedra_of(shape, cells)
+            kind = "triangles" if shape == "quad" else "tetrahedra"
+            told.append(f"{len(cells)} cells of the kind {shape} are cut into {len(cut)} {kind}")
+            cells, middle, row = cut, middle[owner], row[owner]
         nodes.append(cells)
         middles.append(middle)
         rows.append(row)

@@ -1,4 +1,5 @@
-"""Hexahedra, prisms and pyramids cut into tetrahedra, so that the cuts of neighbours agree.
+"""Hexahedra, prisms and pyramids cut into tetrahedra, so that the cuts of neighbours agree; quadrilaterals cut into
+triangles.
 
 A cell is cut from its lowest node to all of its faces that do not hold this node; a face with four nodes is cut by the
 diagonal from its own lowest node. The diagonal of a face depends on the numbers of its nodes alone, so both cells at
@@ -45,6 +46,16 @@ def tetrahedra_of(shape: str, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray
     together, owner = np.concatenate(tetrahedra), np.concatenate(owners)
     # A face runs counter-clockwise seen from outside: turned, it makes a positive volume with a node inside.
     together = together[:, [0, 2, 1, 3]]
+    ordered = np.sort(together, axis=1)
+    proper = (ordered[:, 1:] != ordered[:, :-1]).all(axis=1)
+    order = np.argsort(owner[proper], kind="stable")
+    return together[proper][order], owner[proper][order]
+
+
+def triangles_of(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """[t, 3] the triangles of quadrilaterals [c, 4], ordered by cell; [t] the cell that each belongs to. A cell may
+    name a node twice, where it is a triangle."""
+    together, owner = (np.concatenate(parts) for parts in zip(*_triangles(cells), strict=True))
     ordered = np.sort(together, axis=1)
     proper = (ordered[:, 1:] != ordered[:, :-1]).all(axis=1)
     order = np.argsort(owner[proper], kind="stable")
