@@ -10,6 +10,7 @@ from blocks import block
 from test_jobs import solved
 
 from ast_sim.importers.series import FieldNames, read_series
+from ast_sim.importers.solved_jobs.job import read_job
 from ast_sim.scene import NodeType
 from ast_sim.support.errors import DatasetError
 
@@ -37,6 +38,12 @@ def cube(*steps, model=(), material=()):
     lines += [*listed("FLOOR", HEIGHT == 0), *listed("TOP", HEIGHT == 2)]
     lines += ["*MATERIAL, NAME=M", "*ELASTIC", "1000., 0.3", *material, "*SOLID SECTION, ELSET=ALL, MATERIAL=M"]
     return [*lines, *model, "*BOUNDARY", "FLOOR, 1, 3", *(line for one in steps for line in one)]
+
+
+def written(folder, lines):
+    path = folder / "job.inp"
+    path.write_text("\n".join(lines) + "\n")
+    return path
 
 
 def moved(z, kind=""):
@@ -74,19 +81,75 @@ def test_a_rigid_body_that_is_only_turned_is_prescribed(tmp_path, boundary, driv
     assert (np.abs(way).max() > 0.1) == (turned or driven)
 
 
-@pytest.mark.parametrize("kind", ["CPE3", "CPS3", "CAX3"])
+@pytest.mark.parametrize(
+    ("body", "boundary", "driven"),
+    [
+        ("ROT NODE=999", ["999, 3, 3, 0.2"], True),
+        ("ROT NODE=999", ["FLOOR, 1, 1"], False),
+        ("REF NODE=998", ["998, 11, 11, 20."], False),  # its temperature is given
+        ("REF NODE=998", ["998, 1, 6"], True),
+    ],
+)
+def test_a_rigid_body_needs_no_reference_node(tmp_path, body, boundary, driven):
+    model = [*TURNED[:3], f"*RIGID BODY, NSET=TOP, {body}"]
+    job = read_job(written(tmp_path, cube(step("*BOUNDARY", *boundary), model=model)))
+    at = np.isin(job.mesh.same_point, 1 + np.flatnonzero(HEIGHT == 2))
+    assert at.sum() == 9 and (job.node_type[at] == (NodeType.HANDLE if driven else NodeType.NORMAL)).all()
+    assert any("TOP is prescribed nowhere" in note for note in job.mesh.notes) != driven
+
+
+def test_calculix_puts_a_reference_node_where_a_rigid_body_has_none(tmp_path):
+    model = [*TURNED[:3], "*RIGID BODY, NSET=TOP, ROT NODE=999"]
+    result = read(solved(tmp_path, cube(step("*BOUNDARY", "999, 3, 3, 0.2"), model=model)))
+    top = HEIGHT == 2
+    assert (result.scene.node_type[top] == NodeType.HANDLE).all()
+    before, after = (np.ptp(frame[top][[0, -1]], axis=0) for frame in (result.scene.rest_position, result.position[-1]))
+    turned = np.arctan2(after[1], after[0]) - np.arctan2(before[1], before[0])
+    assert turned == pytest.approx(0.2, abs=1e-4) and np.hypot(*after[:2]) == pytest.approx(np.hypot(*before[:2]))
+
+
+SHEET = [
+    *("*NODE", "1, 0., 0., 0.", "2, 1., 0., 0.", "3, 2., 0., 0.", "4, 0., 1., 0.", "5, 1., 1., 0.", "6, 2., 1., 0."),
+    *("*ELEMENT, TYPE=S4, ELSET=ALL", "1, 1, 2, 5, 4", "2, 2, 3, 6, 5", "*MATERIAL, NAME=M", "*ELASTIC", "2e5, 0.3"),
+    *("*SHELL SECTION, ELSET=ALL, MATERIAL=M", "0.1", "*BOUNDARY", "1, 1, 6", "4, 1, 6", "*STEP", "*STATIC", "1., 1."),
+    *("*BOUNDARY", "3, 3, 3, 0.1", "6, 3, 3, 0.1"),
+]
+
+
+def test_shells_need_results_of_their_own_nodes(tmp_path):
+    flat = [*SHEET, "*NODE FILE, OUTPUT=2D", "U", "*EL FILE, OUTPUT=2D", "S", "*END STEP"]
+    result = read(solved(tmp_path / "flat", flat))
+    way = result.position[1] - result.scene.rest_position
+    assert way[[2, 5], 2] == pytest.approx(0.1) and 0 < way[1, 2] < 0.1
+    assert result.scene.elements.shape == (4, 3) and result.stress.max() > 1e6
+    thick = [*SHEET, "*NODE FILE, OUTPUT=3D", "U", "*END STEP"]
+    with pytest.raises(DatasetError, match="holds 2 elements of a volume, and job.inp 0: .*OUTPUT=2D"):
+        read(solved(tmp_path / "thick", thick))
+
+
+def test_a_job_that_continues_another_one_is_told(tmp_path):
+    path = written(tmp_path, ["*RESTART, READ", *step("*BOUNDARY", "FLOOR, 1, 3")])
+    with pytest.raises(DatasetError, match=r"holds no elements, and continues another job \(\*RESTART, READ\)"):
+        read_job(path)
+
+
+@pytest.mark.parametrize("kind", ["CPE3", "CPS3", "CAX3", "CPE4", "CPS4R", "CAX4"])
 def test_nodes_in_a_plane_are_held_along_two_axes(tmp_path, kind):
     places = [(x, y) for y in range(3) for x in (1, 2, 3)]
     quads = [(1, 2, 5, 4), (2, 3, 6, 5), (4, 5, 8, 7), (5, 6, 9, 8)]
-    triangles = [half for a, b, c, d in quads for half in ((a, b, c), (a, c, d))]
+    cells = quads if "4" in kind else [half for a, b, c, d in quads for half in ((a, b, c), (a, c, d))]
     lines = ["*NODE", *(f"{n}, {x}, {y}, 0." for n, (x, y) in enumerate(places, 1))]
-    lines += [f"*ELEMENT, TYPE={kind}, ELSET=ALL", *(f"{n}, {a}, {b}, {c}" for n, (a, b, c) in enumerate(triangles, 1))]
+    lines += [
+        f"*ELEMENT, TYPE={kind}, ELSET=ALL",
+        *(", ".join(map(str, (n, *cell))) for n, cell in enumerate(cells, 1)),
+    ]
     lines += ["*MATERIAL, NAME=M", "*ELASTIC", "1000., 0.3", "*SOLID SECTION, ELSET=ALL, MATERIAL=M"]
     lines += ["*NSET, NSET=LOW", "1, 2", "*BOUNDARY", "LOW, 1, 2", "3, 2, 2", "*STEP", "*STATIC", "*BOUNDARY"]
     lines += ["7, 2, 2, -0.1", "8, 2, 2, -0.1", "9, 2, 2, -0.1", "*NODE FILE", "U", "*EL FILE", "S", "*END STEP"]
     result = read(solved(tmp_path, lines))
     assert np.flatnonzero(result.scene.node_type == NodeType.HANDLE).tolist() == [0, 1, 6, 7, 8]
     assert "1 nodes are held in some directions only" in result.attributes["notes"]  # node 3 slides
+    assert result.scene.elements.shape == (8, 3)
     way = result.position[1, 6:] - result.scene.rest_position[6:]
     np.testing.assert_allclose(way[:, 1:], [(-0.1, 0)] * 3, atol=1e-6)
 

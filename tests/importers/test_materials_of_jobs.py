@@ -139,6 +139,11 @@ def test_one_line_with_fields_or_parameters_holds_everywhere(job, tmp_path):
     assert (result.scene.material == np.array([1e9, 0.3, 5e7], np.float32)).all()
 
 
+def test_the_first_stress_of_a_single_table_holds_from_no_strain_on(job, tmp_path):
+    result = edited(job, tmp_path, "*ELASTIC\n1000., 0.3", ["*PLASTIC", "50., 0.002", "60., 0.4"])
+    assert (result.scene.material == np.array([1e9, 0.3, 5e7], np.float32)).all()
+
+
 @pytest.mark.parametrize(
     ("elastic", "plastic", "told"),
     [

@@ -192,15 +192,17 @@ def _prescribe(keyword: Keyword, line: Line, state: _Conditions, mesh: SourceMes
     for direction in range(lowest, min(highest, _DIRECTIONS) + 1):
         state.now[rows, direction - 1] = True
     if real(value, line) != 0 or keyword.options.keys() & _FROM_ELSEWHERE:
-        (state.moved if lowest <= 3 else state.turned)[rows] = True
+        state.moved[rows] |= lowest <= 3
+        state.turned[rows] |= 3 < lowest <= _DIRECTIONS
 
 
 def _rigid_body(keyword: Keyword, state: _Conditions, mesh: SourceMesh) -> None:
-    """The nodes of a *RIGID BODY are prescribed as its reference node is; in CalculiX a second node has the turns."""
+    """The nodes of a *RIGID BODY are prescribed as its reference node is; in CalculiX a second node has the turns. A
+    node that is not named CalculiX makes itself: it is free."""
     name = next((keyword.options[key] for key in ("NSET", "ELSET", "TIENSET", "PINNSET") if key in keyword.options), "")
     nodes = rows_of_target(keyword, name, mesh)
-    reference = keyword.required("REFNODE")
-    at = rows_of_target(keyword, reference, mesh)
+    reference = keyword.options.get("REFNODE")
+    at = np.zeros(0, np.int64) if reference is None else rows_of_target(keyword, reference, mesh)
     turns = state.sometimes[at, 3:].any(axis=0)
     is_turned = state.turned[at].any()
     own_axes = state.own_axes[at].any()

@@ -210,14 +210,14 @@ def _elastic(keyword: Keyword) -> dict[str, _ByTemperature]:
 
 
 def _plastic(keyword: Keyword) -> dict[str, _ByTemperature]:
-    """Lines of a stress, a plastic strain and a temperature. The table of each temperature begins at the strain 0; else
-    30,5 was meant as one number."""
+    """Lines of a stress, a plastic strain and a temperature. The table of each temperature begins at the strain 0. A
+    single one may begin above it: CalculiX takes its first stress from 0 on. Without a point, 30,5 was one number."""
     rows: dict[float, float] = {}
     for line in _lines(keyword, 1):
         stress, strain, temperature = _entries(line, 3)
         if "DATATYPE" in keyword.options:  # one line of other numbers
             strain = temperature = 0.0
-        if temperature not in rows and strain:
+        if temperature not in rows and strain and (rows or "." not in line.text):
             where = f" at the temperature {temperature:g}" if rows else ""
             raise keyword.error(f"its first plastic strain{where} is {strain:g}, and it must be 0: write 4.2, not 4,2")
         rows.setdefault(temperature, stress)

@@ -149,6 +149,13 @@ def _same_nodes(job: Job, frame: SourceMesh) -> tuple[np.ndarray, np.ndarray]:
     numbers, rows, there = np.intersect1d(deck.same_point, frame.same_point, return_indices=True)
     used = _used(deck)
     other = f"{frame.path}: holds results of another deck than {deck.path.name}"
+    counts = [sum(len(block.nodes) for block in mesh.blocks if block.dimension == 3) for mesh in (deck, frame)]
+    if counts[1] > counts[0]:
+        raise DatasetError(
+            f"{frame.path}: holds {counts[1]} elements of a volume, and {deck.path.name} {counts[0]}: it is of another"
+            " deck, or CalculiX has made solids of shells and beams; then write *NODE FILE, OUTPUT=2D and *EL FILE,"
+            " OUTPUT=2D"
+        )
     missing = np.setdiff1d(deck.same_point[used], numbers)
     if len(missing):
         raise DatasetError(f"{other}: node {missing[0]} is not in it")
@@ -156,8 +163,9 @@ def _same_nodes(job: Job, frame: SourceMesh) -> tuple[np.ndarray, np.ndarray]:
     if away.any() and not (job.adjusting and 2 * away.sum() < len(away)):
         row = np.flatnonzero(away)[0]
         off = np.abs(deck.points[rows[row]] - frame.points[there[row]]).max()
-        raise DatasetError(f"{other}: node {deck.same_point[rows[row]]} is off by {off:g}")
-    counts = [sum(len(block.nodes) for block in mesh.blocks if block.dimension == 3) for mesh in (deck, frame)]
+        raise DatasetError(
+            f"{other}: node {deck.same_point[rows[row]]} is off by {off:g} (CalculiX reads 20 characters of a number)"
+        )
     if counts[0] != counts[1]:
         raise DatasetError(f"{other}: it has {counts[1]} elements of a volume, the deck {counts[0]}")
     return rows, there
