@@ -51,6 +51,47 @@ def test_hexahedra_prisms_and_pyramids_are_cut_so_that_neighbours_fit(seed):
         assert any(note.startswith(f"{count} cells of the kind {kind} are cut into ") for note in read.notes)
 
 
+def sheet(kinds):
+    """A square of 2 x 2 cells in the plane z = 0 with the numbers 0 to 3, of quadrilaterals, curved ones and triangles:
+    one cell names a node twice, as codes do that have quadrilaterals alone."""
+    corners = np.array([(x, y, 0.0) for x in range(3) for y in range(3)])
+    cells = np.array([(x, x + 3, x + 4, x + 1) for x in (0, 1, 3, 4)])
+    if kinds == "curved":
+        ends = np.stack([cells, np.roll(cells, -1, axis=1)], axis=2).reshape(-1, 2)
+        cells = np.column_stack([cells, 9 + np.arange(16).reshape(4, 4)])
+        return np.concatenate([corners, corners[ends].mean(axis=1)]), [("quad8", cells)], [np.arange(4.0)]
+    if kinds == "plain":
+        return corners, [("quad", cells)], [np.arange(4.0)]
+    first, last = cells[0], cells[3]
+    halves = [last[[0, 1, 2]], last[[0, 2, 3]]] if kinds == "triangles" else []
+    degenerate = np.array([[*first[:3], first[2]], first[[0, 2, 3, 3]], *cells[1:3], *([] if halves else [last])])
+    blocks, numbers = [("quad", degenerate)], [np.array([0.0, 0, 1, 2, 3])[: len(degenerate)]]
+    if halves:
+        blocks, numbers = [("triangle", np.array(halves)), *blocks], [np.array([3.0, 3]), *numbers]
+    return corners, blocks, numbers
+
+
+@pytest.mark.parametrize(("kinds", "cut"), [("plain", 8), ("curved", 8), ("degenerate", 8), ("triangles", 6)])
+def test_flat_meshes_of_quadrilaterals_are_cut_into_triangles(tmp_path, kinds, cut):
+    points, blocks, numbers = sheet(kinds)
+    for frame in range(2):
+        moved = np.zeros_like(points)
+        moved[:, 2] = 0.1 * frame * points[:, 0]
+        fields = {"displacement": moved, "body": np.zeros(len(points), np.int64)}
+        meshio.Mesh(points, blocks, fields, {"E": numbers}).write(tmp_path / f"f{frame}.vtu")
+    trajectory = read_series(tmp_path, FieldNames(material=("E",)))
+    scene = trajectory.scene
+    assert scene.num_nodes == 9 and scene.elements.shape == (8, 3)
+    a, b, c = np.moveaxis(scene.rest_position[scene.elements].astype(float), 1, 0)
+    normals = np.cross(b - a, c - a)
+    assert normals[:, 2] == pytest.approx(1) and not at_rest(scene)  # as the cells look; twice the area of each
+    centre = (a + b + c) / 3
+    assert scene.material is not None and (scene.material[:, 0] == 2 * (centre[:, 0] > 1) + (centre[:, 1] > 1)).all()
+    assert trajectory.position[1, :, 2] == pytest.approx(0.1 * scene.rest_position[:, 0])
+    kind, count = ("quad", {"plain": 4, "curved": 4, "degenerate": 5, "triangles": 4}[kinds])
+    assert f"{count} cells of the kind {kind} are cut into {cut} triangles" in str(trajectory.attributes["notes"])
+
+
 TENSOR = np.array([3.0, -1.0, 0.5, 0.7, -0.2, 0.4])  # xx, yy, zz, xy, yz, zx
 MISES = np.sqrt(0.5 * (4.0**2 + 1.5**2 + 2.5**2) + 3 * (0.7**2 + 0.2**2 + 0.4**2))
 ORDERS = {

@@ -43,23 +43,22 @@ def tetrahedra_of(shape: str, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray
             for triangle, chosen in _triangles(cells[rows][:, face]):
                 tetrahedra.append(np.column_stack([triangle, cells[rows[chosen], corner]]))
                 owners.append(rows[chosen])
-    together, owner = np.concatenate(tetrahedra), np.concatenate(owners)
     # A face runs counter-clockwise seen from outside: turned, it makes a positive volume with a node inside.
-    together = together[:, [0, 2, 1, 3]]
-    ordered = np.sort(together, axis=1)
-    proper = (ordered[:, 1:] != ordered[:, :-1]).all(axis=1)
-    order = np.argsort(owner[proper], kind="stable")
-    return together[proper][order], owner[proper][order]
+    return _proper(np.concatenate(tetrahedra)[:, [0, 2, 1, 3]], np.concatenate(owners))
 
 
 def triangles_of(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """[t, 3] the triangles of quadrilaterals [c, 4], ordered by cell; [t] the cell that each belongs to. A cell may
-    name a node twice, where it is a triangle."""
-    together, owner = (np.concatenate(parts) for parts in zip(*_triangles(cells), strict=True))
-    ordered = np.sort(together, axis=1)
+    """As `tetrahedra_of`: the triangles [t, 3] of quadrilaterals [c, 4], which keep the side that they look to."""
+    triangles, owners = zip(*_triangles(cells), strict=True)
+    return _proper(np.concatenate(triangles), np.concatenate(owners))
+
+
+def _proper(elements: np.ndarray, owner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The elements that name no node twice, ordered by the cell that owns them."""
+    ordered = np.sort(elements, axis=1)
     proper = (ordered[:, 1:] != ordered[:, :-1]).all(axis=1)
     order = np.argsort(owner[proper], kind="stable")
-    return together[proper][order], owner[proper][order]
+    return elements[proper][order], owner[proper][order]
 
 
 def _triangles(faces: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
