@@ -68,9 +68,9 @@ def frames_in(path: Path) -> Iterator[SourceMesh]:
     ending = path.suffix.lower()
     if ending in ENDINGS or is_dyna(path):
         yield from vtk_frames(path)
-    elif ending == ".inp":
+    elif ending == ".inp" or (ending == ".msh" and _beginning(path).startswith(b"*")):  # as cgx of CalculiX calls it
         yield deck_mesh(path)
-    elif ending == ".msh" and b"$MeshFormat" in _beginning(path):
+    elif ending == ".msh" and re.search(rb"(?m)^\$(MeshFormat|NOD)\s*$", _beginning(path)):
         yield from gmsh_frames(path)
     elif ending == ".stl":
         yield _surface(path)

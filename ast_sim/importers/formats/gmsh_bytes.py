@@ -9,7 +9,7 @@ import numpy as np
 
 from ast_sim.support.errors import DatasetError
 
-_VERSIONS = (2.0, 2.1, 2.2, 4.1)
+_VERSIONS = (1.0, 2.0, 2.1, 2.2, 4.1)
 
 
 class Section:
@@ -17,7 +17,8 @@ class Section:
 
     def __init__(self, name: str, content: bytes, place: int, version: float, order: str | None) -> None:
         self.name_of_variant = name
-        self.name = "Nodes" if name == "ParametricNodes" else name
+        self.name = {"ParametricNodes": "Nodes", "NOD": "Nodes", "ELM": "Elements"}.get(name, name)
+        self.end_mark = f"${'End' if version > 1 else 'END'}{name}".encode()
         self.content, self.place, self.version, self.order = content, place, version, order
         self.tokens: list[bytes] | None = None
         self.next_token = 0
@@ -38,7 +39,7 @@ class Section:
         self.place = self._find_end()
 
     def _find_end(self) -> int:
-        end = self.content.find(b"$End" + self.name_of_variant.encode(), self.place)
+        end = self.content.find(self.end_mark, self.place)
         if end < 0:
             raise ValueError(f"the section {self.name_of_variant} has no end")
         return end
@@ -76,7 +77,7 @@ class Section:
         return self._numbers(count, "f8")
 
     def records_of_nodes(self, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Of format 2: the numbers [count] and points [count, 3]."""
+        """Of formats 1 and 2: the numbers [count] and points [count, 3]."""
         if self.name_of_variant == "ParametricNodes":
             return self._parametric_nodes(count)
         if self.order is None:
@@ -106,7 +107,7 @@ class Section:
         return numbers, points
 
     def records_of_elements(self, count: int, nodes: Callable[[int], int]) -> Iterator[tuple[int, int, np.ndarray]]:
-        """Of format 2: (type, number of tags, rows) of elements alike; a row is number, tags, nodes.
+        """Of formats 1 and 2: (type, number of tags, rows) of elements alike; a row is number, tags, nodes.
 
         Args:
             nodes: the number of nodes of a type.
@@ -126,6 +127,8 @@ class Section:
         self.place = self.end
         by_form: dict[tuple[int, int], list[list[bytes]]] = {}
         for entries in filter(None, (line.split() for line in lines)):
+            if self.version < 2:  # two tags and the number of nodes
+                entries[2:5] = [b"2", *entries[2:4]]
             kind, tags = int(entries[1]), int(entries[2])
             if len(entries) != 3 + tags + nodes(kind):
                 raise ValueError(f"element {int(entries[0])} has {len(entries) - 3 - tags} nodes")
@@ -154,7 +157,7 @@ class Section:
         end = self._find_end()
         if self.content[self.place : end].strip():
             raise ValueError(f"the section {self.name} holds more than it says")
-        return end + len(b"$End" + self.name_of_variant.encode())
+        return end + len(self.end_mark)
 
 
 class Reader:
@@ -167,11 +170,12 @@ class Reader:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.content = path.read_bytes()
-        lines = self.content[:200].split(b"\n")
-        start = next((row for row, line in enumerate(lines) if line.strip() == b"$MeshFormat"), None)
+        lines = self.content[: 1 << 16].split(b"\n")  # comments may come first
+        start = next((row for row, line in enumerate(lines) if line.strip() in (b"$MeshFormat", b"$NOD")), None)
         try:
             assert start is not None
-            version, binary, _ = lines[start + 1].split()
+            first = lines[start].strip() == b"$NOD"  # the first format does not say what it is
+            version, binary, _ = (b"1", b"0", b"") if first else lines[start + 1].split()
             self.version = float(version)
         except (AssertionError, ValueError, IndexError):
             raise DatasetError(
