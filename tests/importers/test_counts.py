@@ -4,10 +4,12 @@ import re
 import subprocess
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 import pyvista
 from blocks import block
+from scipy.io import netcdf_file
 from vtkmodules.vtkCommonDataModel import vtkUnstructuredGrid
 from vtkmodules.vtkIOExodus import vtkExodusIIWriter
 
@@ -96,3 +98,59 @@ def test_an_exodus_file_of_which_vtk_reads_another_part_is_refused(tmp_path, mon
     monkeypatch.setattr(vtk_files._worker, "ask", answer)
     with pytest.raises(DatasetError, match=r"a.exo: says that it holds \d+ points and \d+ cells, but VTK reads"):
         read_mesh(tmp_path / "a.exo")
+
+
+def exodus_of(path: Path, kind: str, nodes: int) -> tuple[np.ndarray, np.ndarray]:
+    """Three elements of a kind, each of its own points. The points, and the nodes of the elements."""
+    rng = np.random.default_rng(nodes)
+    points, cells = rng.random((3 * nodes, 3)), rng.permutation(3 * nodes).reshape(3, nodes)
+    sizes = {"time_step": None, "len_string": 33, "len_line": 81, "four": 4, "num_dim": 3, "num_nodes": len(points)}
+    sizes |= {"num_elem": 3, "num_el_blk": 1, "num_el_in_blk1": 3, "num_nod_per_el1": nodes}
+    with netcdf_file(path, "w") as file:
+        file.api_version = file.version = np.float32(5.1)
+        file.floating_point_word_size, file.file_size, file.title = np.int32(8), np.int32(1), b"a"
+        for name, size in sizes.items():
+            file.createDimension(name, size)
+        file.createVariable("time_whole", "d", ("time_step",))
+        file.createVariable("eb_status", "i", ("num_el_blk",))[:] = 1
+        numbers = file.createVariable("eb_prop1", "i", ("num_el_blk",))
+        numbers[:], numbers.name = 1, b"ID"
+        for axis, values in zip("xyz", points.T, strict=True):
+            file.createVariable(f"coord{axis}", "d", ("num_nodes",))[:] = values
+        rows = file.createVariable("connect1", "i", ("num_el_in_blk1", "num_nod_per_el1"))
+        rows[:], rows.elem_type = cells + 1, kind.encode()
+    return points, cells
+
+
+KINDS = [
+    ("TRI", 3, (3, 6), (4, 7)),
+    ("QUAD", 4, (4, 8, 9), (5,)),
+    ("SHELL", 4, (4, 8), (6, 9)),
+    ("SHELL", 3, (3,), ()),
+    ("TETRA", 4, (4, 10, 15), (5, 8, 11, 14)),
+    ("PYRAMID", 5, (5, 13), (14, 18, 19)),
+    ("wedge", 6, (6, 15, 18, 21), (7, 12, 16, 20)),
+    ("HEX", 8, (8, 20, 27), (9, 12, 21, 26, 64)),
+]
+
+
+@pytest.mark.parametrize(("kind", "corners", "known", "mistaken"), KINDS)
+def test_elements_of_exodus_have_the_nodes_of_the_file_or_are_refused(tmp_path, kind, corners, known, mistaken):
+    """VTK takes rows of other lengths where it does not know how many nodes such an element may have."""
+    path = tmp_path / "a.e"
+    for nodes in known:
+        points, cells = exodus_of(path, kind, nodes)
+        (mesh,) = vtk_files.vtk_frames(path)
+        assert (mesh.points[mesh.blocks[0].nodes[:, :corners]] == points[cells[:, :corners]]).all()
+    for nodes in mistaken:
+        exodus_of(path, kind, nodes)
+        with pytest.raises(DatasetError, match=f"a.e: holds {kind} elements of {nodes} nodes, and VTK mistakes"):
+            read_mesh(path)
+
+
+def test_elements_that_vtk_mistakes_are_refused_in_netcdf_4_as_well(tmp_path):
+    with h5py.File(tmp_path / "a.e", "w") as file:
+        file["connect1"] = np.ones((2, 14), np.int32)
+        file["connect1"].attrs["elem_type"] = np.bytes_("TETRA14")
+    with pytest.raises(DatasetError, match=r"a.e: holds TETRA14 elements of 14 nodes, .* with 4, 10 or 15 nodes$"):
+        read_mesh(tmp_path / "a.e")

@@ -30,7 +30,7 @@ import numpy as np
 
 from ast_sim.importers.formats.frd_given_up import given_up
 from ast_sim.importers.formats.frd_results import partly_given, read_frd_headers
-from ast_sim.importers.formats.vtk_data import Block, Refused, arrays_of, blocks_of, time_of
+from ast_sim.importers.formats.vtk_data import Block, Refused, arrays_of, blocks_of, of_used_points, time_of
 
 _ENDINGS_OF_EXODUS = {".e", ".ex2", ".exo", ".exoii", ".exii", ".g", ".gen"}
 
@@ -122,7 +122,10 @@ def _read(path: Path, step: int) -> tuple[dict[str, Any], list[dict[str, np.ndar
     data = file.reader.GetOutputDataObject(0)
     blocks = blocks_of(data)
     time = time_of(data, blocks) if file.set_step is None else file.times[step]
-    return {"steps": len(file.times), "time": time, **file.facts}, [arrays_of(block) for block in blocks]
+    pieces = [arrays_of(block) for block in blocks]
+    if path.suffix.lower() in _ENDINGS_OF_EXODUS:  # each block has all points of the file
+        pieces = [of_used_points(piece) if "connectivity" in piece else piece for piece in pieces]
+    return {"steps": len(file.times), "time": time, **file.facts}, pieces
 
 
 @dataclass
@@ -247,7 +250,7 @@ def _exodus(path: Path) -> _Opened:
     reader.SetFileName(_name(path))
     reader.UpdateInformation()
     reader.ApplyDisplacementsOff()
-    reader.GenerateGlobalNodeIdArrayOn()
+    reader.SetSqueezePoints(False)  # VTK would round the points of each block to single precision
     for kind in (Reader.NODAL, Reader.ELEM_BLOCK, Reader.NODE_SET):
         reader.SetAllArrayStatus(kind, 1)
     for index in range(reader.GetNumberOfObjects(Reader.NODE_SET)):

@@ -84,8 +84,7 @@ def arrays_of(block: Block) -> dict[str, np.ndarray]:
 
     data = block.data
     if block.of_set:
-        ids = _numpy(data.GetPointData().GetGlobalIds())
-        return {} if ids is None else {f"group {block.of_set}": ids}
+        return {f"group {block.of_set}": _numpy(data.GetCells().GetConnectivityArray()).astype(np.int64)}
     if not isinstance(data, vtkUnstructuredGrid):
         append = vtkAppendFilter()
         append.AddInputData(data)
@@ -111,6 +110,13 @@ def arrays_of(block: Block) -> dict[str, np.ndarray]:
                     arrays[f"{place}-columns {array.GetName()}"] = np.array(names, "S")
     ids = _numpy(data.GetPointData().GetGlobalIds())
     return arrays if ids is None else {**arrays, "global": ids}
+
+
+def of_used_points(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The arrays of a mesh that has all points of its file, for the points of its cells alone; `global` numbers them."""
+    used, nodes = np.unique(arrays["connectivity"], return_inverse=True)
+    at_points = [name for name in arrays if name == "points" or name.startswith("point ")]
+    return {**arrays, "connectivity": nodes.ravel(), "global": used, **{name: arrays[name][used] for name in at_points}}
 
 
 def _numpy(array: Any) -> Any:
