@@ -81,3 +81,87 @@ def test_a_mesh_of_cgx_is_a_deck(tmp_path, first):
     (tmp_path / "all.msh").write_text(f"{first}\n{nodes}*ELEMENT, TYPE=C3D4, ELSET=Eall\n1, 1, 2, 3, 4\n")
     mesh = read_mesh(tmp_path / "all.msh")
     assert mesh.elements.tolist() == [[0, 1, 2, 3]] and sorted(mesh.groups) == ["Eall", "Nall"]
+
+
+def xdmf(grids):
+    include = 'xmlns:xi="http://www.w3.org/2001/XInclude"'
+    return f'<?xml version="1.0"?>\n<Xdmf Version="3.0" {include}><Domain>{grids}</Domain></Xdmf>'
+
+
+def items(values, columns):
+    text = " ".join(map(str, np.ravel(values)))
+    number = "Int" if np.asarray(values).dtype.kind == "i" else "Float"
+    return f'<DataItem Dimensions="{len(values)} {columns}" NumberType="{number}" Format="XML">{text}</DataItem>'
+
+
+POINTS = [(0.0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 1)]
+GEOMETRY = f'<Geometry GeometryType="XYZ">{items(POINTS, 3)}</Geometry>'
+INCLUDED = "<xi:include xpointer=\"xpointer(/Xdmf/Domain/Grid[@Name='{}']/{})\" />"
+
+
+SHARED = INCLUDED.format("mesh", "Geometry")
+
+
+def marks(name, kind, cells, values, points=SHARED):
+    count = f'NumberOfElements="{len(cells)}"'
+    topology = f'<Topology TopologyType="{kind}" {count}>{items(cells, len(cells[0]))}</Topology>'
+    field = f'<Attribute Name="{name}" AttributeType="Scalar" Center="Cell">{items(values, 1)}</Attribute>'
+    return f'<Grid Name="{name}" GridType="Uniform">{points}{topology}{field if len(values) else ""}</Grid>'
+
+
+CELLS, FACES = [(0, 1, 2, 3), (1, 3, 4, 2)], [(0, 1, 2), (1, 2, 4), (0, 2, 3)]
+MESH = marks("mesh", "Tetrahedron", CELLS, [], GEOMETRY)
+FACETS = marks("facet markers", "Triangle", FACES, [1, 2, 3])
+EITHER = INCLUDED.format("mesh", "*[self::Topology or self::Geometry]")
+
+
+@pytest.mark.parametrize(
+    ("grids", "fields", "left"),
+    [
+        (MESH + FACETS, [], "facet markers"),
+        (MESH + marks("cell markers", "Tetrahedron", CELLS, [7, 8]) + FACETS, ["cell markers"], "facet markers"),
+        (MESH + marks("some", "Tetrahedron", CELLS[1:], [8]), [], "some"),
+        (MESH + marks("other", "Triangle", FACES, [1, 2, 3], EITHER), [], "other"),
+        (
+            f'<Grid Name="mesh" GridType="Uniform">{GEOMETRY}</Grid>'
+            + FACETS
+            + marks("cell markers", "Tetrahedron", CELLS, [7, 8]),
+            ["cell markers"],
+            "facet markers",
+        ),
+    ],
+)
+def test_marks_of_fenics_are_grids_beside_the_mesh(tmp_path, grids, fields, left):
+    """dolfinx writes meshtags so. The points may stand in a grid without cells."""
+    (tmp_path / "a.xdmf").write_text(xdmf(grids))
+    mesh = read_mesh(tmp_path / "a.xdmf")
+    np.testing.assert_array_equal(mesh.points, POINTS)
+    assert mesh.elements.tolist() == [list(one) for one in CELLS]
+    assert list(mesh.source.cell_fields) == fields and f"grids on the same points are left out: {left}" in mesh.notes
+    if fields:
+        assert mesh.fields["cell"]["cell markers"].ravel().tolist() == [7, 8]
+
+
+@pytest.mark.parametrize(
+    ("grids", "cause"),
+    [
+        (MESH + MESH, "holds 2 grids with points of their own: write all bodies into one grid"),
+        (MESH + marks("a", "Triangle", FACES, [1, 2, 3], ""), r"the grid 'a' has no points, but \[\]"),
+        (MESH + marks("a", "Triangle", FACES, [1], INCLUDED.format("none", "Geometry")), "the grid 'a' has no points"),
+    ],
+)
+def test_grids_on_other_points_are_refused(tmp_path, grids, cause):
+    (tmp_path / "a.xdmf").write_text(xdmf(grids))
+    with pytest.raises(DatasetError, match=f"a.xdmf: {cause}"):
+        read_mesh(tmp_path / "a.xdmf")
+
+
+def test_a_solid_of_stl_may_end_in_two_words(tmp_path):
+    facet = "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\n"
+    other = facet.replace("1 0 0", "2 0 0")
+    (tmp_path / "a.stl").write_text(f"solid WRAP\n{facet}end solid\nsolid B\n{other}end solid B\n")
+    mesh = read_mesh(tmp_path / "a.stl")
+    assert mesh.elements.shape == (2, 3) and mesh.points[:, 0].max() == 2
+    (tmp_path / "a.stl").write_text(f"solid WRAP\n{facet}")
+    with pytest.raises(DatasetError, match="a.stl: .* it is cut off after 1 facets"):
+        read_mesh(tmp_path / "a.stl")

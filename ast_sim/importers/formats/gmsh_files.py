@@ -1,8 +1,8 @@
 """Meshes in the files of Gmsh, `.msh` of the formats 1, 2 and 4.1, as text or binary.
 
 Gmsh writes an element once for each of its physical groups in formats 1 and 2; whoever makes elements of the cells
-takes each once. Format 4.1 says the groups of geometric entities, partitioned ones among them, and each block of elements belongs
-to an entity. Source: the reference manual of Gmsh, chapter "File formats".
+takes each once. Format 4.1 says the groups of geometric entities, partitioned ones among them, and each block of
+elements belongs to an entity. Source: the reference manual of Gmsh, chapter "File formats".
 """
 
 from __future__ import annotations

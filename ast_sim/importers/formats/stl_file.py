@@ -16,7 +16,7 @@ _MARK = b"\xef\xbb\xbf"  # with which some editors of Windows begin a text
 _TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("colour", "<u2")])
 _WORDS = re.compile(rb"[^\s]+")
 _SOLID = re.compile(rb"(?im)^[ \t]*solid\b[ \t]*(.*?)[ \t]*$")
-_END = re.compile(rb"(?im)^[ \t]*endsolid\b")
+_END = re.compile(rb"(?im)^[ \t]*end[ \t]*solid\b")
 
 
 class BadSurface(Exception):

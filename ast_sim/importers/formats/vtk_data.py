@@ -113,7 +113,7 @@ def arrays_of(block: Block) -> dict[str, np.ndarray]:
 
 
 def of_used_points(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The arrays of a mesh that has all points of its file, for the points of its cells alone; `global` numbers them."""
+    """The arrays of a mesh that has all points of its file, for the points of its cells alone; `global` are these."""
     used, nodes = np.unique(arrays["connectivity"], return_inverse=True)
     at_points = [name for name in arrays if name == "points" or name.startswith("point ")]
     return {**arrays, "connectivity": nodes.ravel(), "global": used, **{name: arrays[name][used] for name in at_points}}

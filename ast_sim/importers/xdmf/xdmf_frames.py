@@ -14,6 +14,7 @@ import numpy as np
 
 from ast_sim.importers.formats.source_mesh import SourceMesh, from_meshio
 from ast_sim.importers.meshio_files import by_meshio, what_meshio_says
+from ast_sim.importers.xdmf.xdmf_grids import with_one_grid
 from ast_sim.importers.xdmf.xdmf_items import made_of_others, with_joined_points, write_out
 from ast_sim.support.errors import DatasetError
 
@@ -39,12 +40,15 @@ def xdmf_frames(path: Path) -> Iterator[SourceMesh]:
             " .pvd"
         )
     named = ", ".join(dict.fromkeys(one.get("Name", "without a name") for one in tree.iter("Set")))
-    sets = [f"sets are not read: {named}"] if named else []
+    told = [f"sets are not read: {named}"] if named else []
+    several = not series and len(tree.findall("Domain/Grid")) > 1
+    told += [] if series else with_one_grid(path, tree)
     time, timed = (None, False) if series else _without_time(path, tree)
     if series:
         _require_plain(path, series)
         _require_no_other(path, tree, series[0])
     changes = [
+        several,
         _with_defaults(tree),
         _with_references(path, tree),
         timed,
@@ -55,7 +59,7 @@ def xdmf_frames(path: Path) -> Iterator[SourceMesh]:
         if not series:
             mesh = by_meshio(path, copy)
             _require_count(mesh, tree.find(".//Topology"))
-            yield replace(mesh, time=time, notes=[*mesh.notes, *sets])
+            yield replace(mesh, time=time, notes=[*mesh.notes, *told])
             return
         try:
             with meshio.xdmf.TimeSeriesReader(copy) as reader:
@@ -69,7 +73,7 @@ def xdmf_frames(path: Path) -> Iterator[SourceMesh]:
                     mesh = from_meshio(frame, path)
                     topology = grid.find("Topology")
                     _require_count(mesh, tree.find(".//Topology") if topology is None else topology)
-                    yield replace(mesh, time=float(time), notes=[*mesh.notes, *sets])
+                    yield replace(mesh, time=float(time), notes=[*mesh.notes, *told])
         except DatasetError:
             raise
         except (Exception, SystemExit) as error:
