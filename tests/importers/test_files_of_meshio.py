@@ -112,7 +112,6 @@ def nastran(folder, text):
         ("GRID,1,5,0.,0.,0.\n", "GRID with a coordinate system of its own"),
         (f"{'GRID*':8}{1:16}{5:16}{0.0:16}{0.0:16}\n{'*':8}{0.0:16}\n", "GRID with a coordinate system of its own"),
         (f"GRDSET  {'':8}{5:8}\n{WHOLE}", "GRDSET with a coordinate system of its own"),
-        (f"INCLUDE 'more.bdf'\n{WHOLE}", "an INCLUDE"),
         (f"{WHOLE}CHEX20  {7:8}{1:8}\n", "CHEX20 elements"),
         (f"{WHOLE}CQUADX,7,1,1,2,3,4\n", "CQUADX elements"),
     ],
@@ -130,17 +129,102 @@ def test_cards_of_nastran_that_say_nothing_of_elements_are_passed_over(tmp_path,
     assert volume(nastran(tmp_path, WHOLE.replace(GRIDS, in_space))) == pytest.approx(1)
 
 
-@pytest.mark.parametrize("end", [" " * 8, "+       ", ""])
-def test_a_card_of_nastran_whose_next_line_is_lost_is_refused(tmp_path, end):
+@pytest.mark.parametrize("end", [" " * 8, "+       ", "", "+A1"])
+def test_a_card_of_nastran_goes_on_in_the_next_line(tmp_path, end):
     """An editor that strips lines makes meshio leave out the second line of an element."""
     text = GRIDS + card("CHEXA", [1 + node for node in HEXAHEDRON[0]], end)
     if end.startswith("+"):
-        text = text.replace("\n        ", "\n+       ")
-    if end:
-        assert volume(nastran(tmp_path, text)) == pytest.approx(1)
-    else:
-        with pytest.raises(DatasetError, match="cells of the kind hexahedron have 6 nodes; must have 8: are lines"):
-            nastran(tmp_path, text)
+        text = text.replace("\n        ", f"\n{end:8}")
+    assert volume(nastran(tmp_path, text)) == pytest.approx(1)
+    first, second, _ = text.removeprefix(GRIDS).split("\n")
+    with pytest.raises(DatasetError, match="CHEXA 1 .line 12. has the nodes 1, 5, 7, 3, 2, 6; must have 8 or 20"):
+        nastran(tmp_path, GRIDS + first + "\n")
+    if end == "+A1":
+        with pytest.raises(DatasetError, match="line 13 does not go on with the line before it: sort its lines"):
+            nastran(tmp_path, f"{GRIDS}{first}\n{second.replace('+A1', '+B1')}\n")
+
+
+def free(number, nodes, more="", name="CTETRA"):
+    """An element between commas; in lines of eight fields."""
+    return f"{name},{number},1,{','.join(str(node) for node in nodes)}{more}\n"
+
+
+FREE = "".join(free(1 + row, 1 + cell) for row, cell in enumerate(CUBE.elements))
+WIDE = "".join(
+    f"{'GRID*':8}{1 + row:16}{'':16}{x:16}{y:16}\n{'*':8}{z:16}\n" for row, (x, y, z) in enumerate(POINTS.tolist())
+)
+SPELLINGS = {
+    "small": GRIDS + WHOLE.removeprefix(GRIDS),
+    "free": GRIDS + FREE,
+    "lower case": (GRIDS + FREE).lower(),
+    "wide": WIDE + FREE,
+    "comments": "$ a comment\n" + GRIDS.replace("\n", " $ a point\n") + FREE,
+    "windows": (GRIDS + FREE).replace("\n", "\r\n"),
+    "tabs": "".join(f"GRID\t{1 + row}\t\t{x}\t{y}\t{z}\n" for row, (x, y, z) in enumerate(POINTS.tolist())) + FREE,
+    "a default of points": "GRDSET,,,,,,,6\n" + GRIDS + FREE,
+    "Nastran's exponents": GRIDS.replace("1.000", "10.-1") + FREE,
+    "blank zeros": GRIDS.replace("0.000", "     ") + FREE,
+}
+
+
+@pytest.mark.parametrize("spelling", SPELLINGS)
+@pytest.mark.parametrize(("begin", "end"), [(BEGIN, "ENDDATA\n"), ("", ""), ("BEGIN SUPER=1\n", "ENDDATA")])
+def test_decks_of_nastran_in_all_spellings(tmp_path, spelling, begin, end):
+    """Gmsh and OptiStruct write decks without BEGIN BULK; included files lack ENDDATA."""
+    (tmp_path / "a.bdf").write_bytes((begin + SPELLINGS[spelling] + end).encode())
+    mesh = read_mesh(tmp_path / "a.bdf")
+    assert len(mesh.elements) == 6 and volume(mesh) == pytest.approx(1)
+    np.testing.assert_allclose(mesh.points, POINTS)
+
+
+FLAT = "".join(
+    grid(1 + row, point) for row, point in enumerate([(0, 0, 0), (2, 0, 0), (2, 1, 0), (0, 1, 0), (1, 0, 0)])
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "kinds"),
+    [
+        (free(1, (1, 2, 3), ",30.0,0.1", "CTRIA3"), ["triangle"]),  # an angle, an offset
+        (free(1, (1, 2, 3, 4), ",45.", "CQUAD4"), ["quad"]),
+        (free(1, (1, 2, 3, 4), "", "CQUADR"), ["quad"]),
+        ("CQUAD8,1,1,1,2,3,4,5,,\n+,,,0.1,0.1\n", ["quad"]),  # three middles are left out
+        (free(1, (1, 2, 3, 5, "", ""), "", "CTRIA6"), ["triangle"]),
+        (free(1, (1, 2, 3), "", "CTRIAR") + free(2, (1, 2), ",0.,1.,0.", "CBAR"), ["triangle", "line"]),
+        ("CTRIA3,1,,1,2,3\n", ["triangle"]),  # the property is the number of the element
+    ],
+)
+def test_surfaces_of_nastran_may_have_fields_behind_their_nodes(tmp_path, text, kinds):
+    mesh = nastran(tmp_path, FLAT + text)
+    assert [block.kind for block in mesh.source.blocks] == kinds
+    assert set(mesh.elements.ravel()) == {0, 1, 2, 3} if kinds == ["quad"] else {0, 1, 2}
+
+
+def test_decks_of_nastran_include_others(tmp_path):
+    (tmp_path / "parts").mkdir()
+    (tmp_path / "parts" / "points.inc").write_text(GRIDS)
+    (tmp_path / "cells.inc").write_text(FREE)
+    text = "INCLUDE 'parts\\points.inc'\ninclude \"cells.inc\"\n"
+    assert volume(nastran(tmp_path, text)) == pytest.approx(1)
+    with pytest.raises(DatasetError, match=r"a.bdf: includes none.inc \(line 4\), which there is not: copy it there"):
+        nastran(tmp_path, "INCLUDE none.inc\n")
+    (tmp_path / "cells.inc").write_text("INCLUDE 'a.bdf'\n")
+    with pytest.raises(DatasetError, match=r"a.bdf: includes a.bdf \(line 1 of cells.inc\)"):
+        nastran(tmp_path, text)
+
+
+@pytest.mark.parametrize(
+    ("text", "cause"),
+    [
+        (GRIDS + free(1, (1, 2, 3, 9)), "an element has the node 9, and there is no GRID of this number"),
+        (GRIDS + free(1, (1, 2, 3)), r"CTETRA 1 \(line 12\) has the nodes 1, 2, 3; must have 4 or 10"),
+        (GRIDS + free(1, (1, 2, 3, 1.5)), r"CTETRA 1 \(line 12\) has the nodes 1, 2, 3, 1.5"),
+        ("MAT1,1,2.1e5,,0.3\n", "holds no GRID, so it is no deck of Nastran"),
+    ],
+)
+def test_decks_of_nastran_that_lack_something_are_refused(tmp_path, text, cause):
+    with pytest.raises(DatasetError, match=f"a.bdf: .*{cause}"):
+        nastran(tmp_path, text)
 
 
 @pytest.mark.parametrize(("name", "content"), [("a.off", "OFF\n"), ("a.off", ""), ("a.ply", "ply\nformat ascii 1.0\n")])

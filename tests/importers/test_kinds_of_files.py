@@ -127,12 +127,6 @@ def test_other_kinds_are_refused_with_what_to_do(tmp_path, name):
         read_series(tmp_path / name, NAMES)
 
 
-def test_a_deck_of_nastran_as_gmsh_writes_it_is_refused_with_what_to_do(tmp_path):
-    (tmp_path / "mesh.bdf").write_text("$ Created by Gmsh\nGRID,1,0,0.,0.,0.\nENDDATA\n")
-    with pytest.raises(DatasetError, match="statement not found; if it is whole, write it as .vtu, .vtk, .msh or .inp"):
-        read_mesh(tmp_path / "mesh.bdf")
-
-
 def test_grids_of_xdmf_are_uniform_where_they_do_not_say(tmp_path):
     def one(frame):
         points = " ".join(map(str, pressed(frame).ravel()))

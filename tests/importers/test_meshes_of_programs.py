@@ -48,6 +48,13 @@ def test_the_first_format_of_gmsh_is_read_as_the_second(tmp_path, order):
     assert (first.points[first.groups["7"], 0] == 0).all()
 
 
+@pytest.mark.parametrize("order", [1, 2])
+def test_decks_of_nastran_as_gmsh_writes_them_are_read(tmp_path, order):
+    deck, mesh = (read_mesh(of_gmsh(tmp_path, 2.2, order, name)) for name in ("a.bdf", "a.msh"))
+    np.testing.assert_allclose(deck.points, mesh.points, atol=1e-6)
+    np.testing.assert_array_equal(deck.elements, mesh.elements)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "cause"),
     [
