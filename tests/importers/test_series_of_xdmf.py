@@ -110,3 +110,56 @@ def test_functions_of_finite_elements_are_refused_by_name(tmp_path):
     frames = [topology() + geometry() + displacement(frame, facts) for frame in FRAMES]
     with pytest.raises(DatasetError, match="'displacement' has its values at the place 'Other': .*not by write_check"):
         read_series(series(tmp_path / "a.xdmf", frames), FieldNames(handle="0:zmin"))
+
+
+SHARED = (
+    "<xi:include xpointer=\"xpointer(/Xdmf/Domain/Grid[@GridType='Uniform'][1]/*[self::Topology or self::Geometry])\"/>"
+)
+
+
+def of_functions(path, functions, grid=""):
+    """A mesh and a series for each function: the attribute of each frame by its time."""
+    text = f'<Grid Name="mesh" GridType="Uniform">{topology()}{geometry()}</Grid>'
+    for frames in functions:
+        grids = "".join(
+            f'<Grid GridType="Uniform">{grid or SHARED}<Time Value="{time}"/>{inner}</Grid>' for time, inner in frames
+        )
+        text += f'<Grid GridType="Collection" CollectionType="Temporal">{grids}</Grid>'
+    include = 'xmlns:xi="http://www.w3.org/2001/XInclude"'
+    path.write_text(f'<Xdmf Version="3.0" {include}><Domain>{text}</Domain></Xdmf>')
+    return path
+
+
+MOTION = [(frame, displacement(frame)) for frame in FRAMES]
+STRESS = [
+    (frame, f'<Attribute Name="von_mises" Center="Cell">{item(100.0 * frame + np.arange(6.0))}</Attribute>')
+    for frame in FRAMES
+]
+
+
+@pytest.mark.parametrize("functions", [(MOTION, STRESS), (STRESS, MOTION)])
+def test_fenics_writes_a_series_for_each_function(tmp_path, functions):
+    path = of_functions(tmp_path / "a.xdmf", functions)
+    require_right(path)
+    stress = read_series(path, FieldNames(handle="0:zmin")).stress
+    assert stress[:, :, 0].tolist() == [(100.0 * frame + np.arange(6)).tolist() for frame in FRAMES]
+
+
+@pytest.mark.parametrize(
+    ("functions", "grid"),
+    [
+        ((MOTION, STRESS[:2]), ""),
+        ((MOTION, [(time + 0.5, inner) for time, inner in STRESS]), ""),
+        ((MOTION, STRESS), topology() + geometry()),
+    ],
+)
+def test_series_of_other_times_or_meshes_are_refused(tmp_path, functions, grid):
+    path = of_functions(tmp_path / "a.xdmf", functions, grid)
+    with pytest.raises(DatasetError, match="a.xdmf: holds 2 series of frames, and one can be read"):
+        read_series(path, FieldNames(handle="0:zmin"))
+
+
+def test_two_series_must_not_have_a_field_of_one_name(tmp_path):
+    path = of_functions(tmp_path / "a.xdmf", (MOTION, MOTION))
+    with pytest.raises(DatasetError, match="a.xdmf: a grid has the field 'displacement' twice"):
+        read_series(path, FieldNames(handle="0:zmin"))

@@ -14,7 +14,7 @@ import numpy as np
 
 from ast_sim.importers.formats.source_mesh import SourceMesh, from_meshio
 from ast_sim.importers.meshio_files import by_meshio, what_meshio_says
-from ast_sim.importers.xdmf.xdmf_grids import with_one_grid
+from ast_sim.importers.xdmf.xdmf_grids import with_one_grid, with_one_series
 from ast_sim.importers.xdmf.xdmf_items import made_of_others, with_joined_points, write_out
 from ast_sim.support.errors import DatasetError
 
@@ -31,6 +31,7 @@ def xdmf_frames(path: Path) -> Iterator[SourceMesh]:
         tree = ET.parse(path)
     except (ET.ParseError, OSError, ValueError, LookupError) as error:
         raise DatasetError(f"{path}: cannot be read as a mesh: it is no XML: {error}") from error
+    several = with_one_series(tree)
     _require_understood(path, tree)
     series = tree.findall("Domain/Grid[@GridType='Collection']")
     version = str(tree.getroot().get("Version"))
@@ -41,7 +42,7 @@ def xdmf_frames(path: Path) -> Iterator[SourceMesh]:
         )
     named = ", ".join(dict.fromkeys(one.get("Name", "without a name") for one in tree.iter("Set")))
     told = [f"sets are not read: {named}"] if named else []
-    several = not series and len(tree.findall("Domain/Grid")) > 1
+    several |= not series and len(tree.findall("Domain/Grid")) > 1
     told += [] if series else with_one_grid(path, tree)
     time, timed = (None, False) if series else _without_time(path, tree)
     if series:

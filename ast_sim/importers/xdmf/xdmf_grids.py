@@ -1,4 +1,5 @@
-"""Several grids of an XDMF file on the same points, as FEniCS writes marks of cells and faces beside a mesh."""
+"""Several grids of an XDMF file on the same points: FEniCS writes marks of cells and faces beside a mesh, and a series
+for each function."""
 
 from __future__ import annotations
 
@@ -39,6 +40,25 @@ def with_one_grid(path: Path, tree: ET.ElementTree[Any]) -> list[str]:
     lost = [grid for grid in others if grid.find("Attribute") is not None or -1 < _rank(grid)[0] != _rank(kept)[0]]
     named = [grid.get("Name", "without a name") for grid in lost]
     return [f"grids on the same points are left out: {', '.join(named)}"] if named else []
+
+
+def with_one_series(tree: ET.ElementTree[Any]) -> bool:
+    """Put the fields of all series into the first, if they have the same times and no points or cells of their own.
+    Whether there are several such."""
+    domain = tree.find("Domain")
+    series = tree.findall("Domain/Grid[@GridType='Collection']")
+    times = [[time.get("Value") for time in one.iterfind("Grid/Time")] for one in series]
+    own = [one for one in series[1:] if one.find("Grid/Geometry") is not None or one.find("Grid/Topology") is not None]
+    if domain is None or len(series) < 2 or own or any(one != times[0] for one in times):
+        return False
+    first, *others = series
+    if any(one.get("CollectionType") != "Temporal" or len(one) != len(first) for one in series):
+        return False
+    for other in others:
+        for grid, further in zip(first, other, strict=True):
+            grid.extend(further.findall("Attribute"))
+        domain.remove(other)
+    return True
 
 
 def _points(path: Path, tree: ET.ElementTree[Any], grid: ET.Element) -> ET.Element:
