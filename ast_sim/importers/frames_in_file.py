@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import re
+import tempfile
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from ast_sim.element_topology import is_closed
 from ast_sim.importers.decks.deck_mesh import deck_mesh
-from ast_sim.importers.formats.gmsh_fields import has_steps
-from ast_sim.importers.formats.gmsh_files import gmsh_frames
 from ast_sim.importers.formats.source_mesh import CellBlock, SourceMesh
 from ast_sim.importers.formats.stl_file import BadSurface, read_stl
 from ast_sim.importers.formats.vtk_files import BLOCKS, ENDINGS, is_dyna, vtk_frames
 from ast_sim.importers.meshio_files import BY_MESHIO, by_meshio
+from ast_sim.importers.msh.gmsh_fields import has_steps
+from ast_sim.importers.msh.gmsh_files import gmsh_frames
 from ast_sim.importers.xdmf.xdmf_frames import xdmf_frames
 from ast_sim.support.errors import DatasetError
 
@@ -66,7 +68,16 @@ def frames_in(path: Path) -> Iterator[SourceMesh]:
     if not path.is_file():
         raise DatasetError(f"{path}: there is no such file")
     ending = path.suffix.lower()
-    if ending in ENDINGS or is_dyna(path):
+    true = _ending_of_vtk(path) if ending in (".vtk", ".vtu", ".vtp", ".vts") else ending
+    if true != ending:
+        with tempfile.TemporaryDirectory() as folder:
+            link = Path(folder) / (path.stem + true)
+            link.symlink_to(path.resolve())
+            try:
+                yield from (replace(frame, path=path) for frame in vtk_frames(link))
+            except DatasetError as error:
+                raise DatasetError(str(error).replace(str(link), str(path))) from error
+    elif ending in ENDINGS or is_dyna(path):
         yield from vtk_frames(path)
     elif ending == ".inp" or (ending == ".msh" and _beginning(path).startswith(b"*")):  # as cgx of CalculiX calls it
         yield deck_mesh(path)
@@ -78,6 +89,16 @@ def frames_in(path: Path) -> Iterator[SourceMesh]:
         yield from xdmf_frames(path)
     else:
         yield by_meshio(path)
+
+
+def _ending_of_vtk(path: Path) -> str:
+    """The ending that a file of VTK must have by its first bytes: some programs write legacy files as .vtu, or XML as
+    .vtk."""
+    head = _beginning(path)
+    kind = re.search(rb"<VTKFile\b[^>]*\btype\s*=\s*[\"'](UnstructuredGrid|PolyData|StructuredGrid)[\"']", head)
+    if kind:
+        return {b"U": ".vtu", b"P": ".vtp", b"S": ".vts"}[kind[1][:1]]
+    return ".vtk" if head.startswith(b"# vtk DataFile") else path.suffix.lower()
 
 
 def _beginning(path: Path) -> bytes:

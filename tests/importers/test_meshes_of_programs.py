@@ -6,6 +6,7 @@ import sys
 
 import numpy as np
 import pytest
+import pyvista
 
 from ast_sim.importers.mesh_file import read_mesh
 from ast_sim.support.errors import DatasetError
@@ -172,3 +173,104 @@ def test_a_solid_of_stl_may_end_in_two_words(tmp_path):
     (tmp_path / "a.stl").write_text(f"solid WRAP\n{facet}")
     with pytest.raises(DatasetError, match="a.stl: .* it is cut off after 1 facets"):
         read_mesh(tmp_path / "a.stl")
+
+
+@pytest.mark.parametrize(("written", "named"), [("vtk", "vtu"), ("vtu", "vtk"), ("vtp", "vtk"), ("vts", "vtk")])
+def test_files_of_vtk_are_told_by_what_they_hold(tmp_path, written, named):
+    """PyLith has written legacy files as .vtu, SOFA XML as .vtk."""
+    cube = pyvista.ImageData(dimensions=(2, 2, 2)).cast_to_structured_grid()
+    mesh = {"vts": cube, "vtp": cube.extract_surface(algorithm="dataset_surface")}.get(
+        written, cube.cast_to_unstructured_grid()
+    )
+    mesh.save(tmp_path / f"a.{written}", binary=False)
+    other = tmp_path / f"b.{named}"
+    (tmp_path / f"a.{written}").rename(other)
+    read = read_mesh(other)
+    np.testing.assert_array_equal(read.points, mesh.points)
+    assert read.path == other and len(read.elements) == (12 if written == "vtp" else 6)
+    other.write_bytes(other.read_bytes()[:-400])
+    with pytest.raises(DatasetError, match=f"^{other}: "):
+        read_mesh(other)
+
+
+SQUARES = [(0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7)]
+CORNERS = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)]
+LINES = [f"{x} {y} {z}" for x, y, z in CORNERS]
+
+
+def off(head="OFF", points=LINES, faces=SQUARES, more=""):
+    rows = [f"{len(face)} {' '.join(map(str, face))}{more}" for face in faces]
+    return "\n".join([head, f"{len(points)} {len(faces)} 0", *points, *rows]) + "\n"
+
+
+def volume(mesh):
+    return np.linalg.det(mesh.points[mesh.elements]).sum() / 6
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        off(),
+        off(more=" 255 0 0"),
+        off(more=" 0.1 0.2 0.3 1.0"),
+        off("COFF", [f"{line} 9 9 9 255" for line in LINES]),
+        off("NOFF", [f"{line} 0 0 1" for line in LINES]),
+        off("# a cube\nOFF # of squares\n"),
+        off().replace("OFF\n8", "OFF 8"),
+        off().replace("\n", "\r\n"),
+        off(faces=[half for a, b, c, d in SQUARES for half in ((a, b, c), (a, c, d))]),
+        off(faces=[*SQUARES[:-1], *[(3, 0, 4), (3, 4, 7)]]),
+    ],
+)
+def test_off_files_of_quadrilaterals_with_colours(tmp_path, text):
+    (tmp_path / "a.off").write_bytes(text.encode())
+    mesh = read_mesh(tmp_path / "a.off")
+    np.testing.assert_array_equal(mesh.points, CORNERS)
+    assert mesh.elements.shape == (12, 3) and volume(mesh) == pytest.approx(1)  # all faces look outwards
+
+
+RING = [(np.cos(angle), np.sin(angle), z) for z in (0, 1) for angle in np.arange(5) * 0.4 * np.pi]
+PRISM = [(4, 3, 2, 1, 0), (5, 6, 7, 8, 9), *((k, (k + 1) % 5, 5 + (k + 1) % 5, 5 + k) for k in range(5))]
+BENT = [(0, 0, 0), (2, 0, 0), (2, 2, 0), (1, 0.5, 0), (0, 2, 0)]
+FORK = [(0, 0, 0), (3, 0, 0), (3, 2, 0), (2, 2, 0), (2, 1, 0), (1, 1, 0), (1, 2, 0), (0, 2, 0)]
+
+
+@pytest.mark.parametrize("ending", ["off", "obj"])
+def test_faces_of_more_than_four_corners_are_cut_into_triangles(tmp_path, ending):
+    def write(points, faces):
+        lines = [" ".join(map(str, point)) for point in points]
+        of_obj = [f"v {line}" for line in lines] + ["f " + " ".join(str(1 + one) for one in face) for face in faces]
+        path = tmp_path / f"a.{ending}"
+        path.write_text(off(points=lines, faces=faces) if ending == "off" else "\n".join(of_obj))
+        return path
+
+    mesh = read_mesh(write(RING, PRISM))
+    assert mesh.elements.shape == (16, 3) and volume(mesh) == pytest.approx(2.5 * np.sin(0.4 * np.pi))
+    between = [(1, 0, 0), *BENT[:3], (0, 2, 0)]  # its first corner lies on an edge
+    flat = read_mesh(write(between, [(0, 2, 3, 4, 1)]))
+    a, b, c = np.moveaxis(flat.points[flat.elements], 1, 0)
+    assert np.cross(b - a, c - a)[:, 2].sum() / 2 == pytest.approx(4) and len(flat.elements) == 3
+    bent = read_mesh(write(BENT, [(0, 1, 2, 3, 4)]))  # from the corner that points inwards
+    a, b, c = np.moveaxis(bent.points[bent.elements], 1, 0)
+    assert (np.cross(b - a, c - a)[:, 2] > 0).all() and np.cross(b - a, c - a)[:, 2].sum() / 2 == pytest.approx(2.5)
+    with pytest.raises(DatasetError, match=f"a.{ending}: a face of 8 corners cannot be cut from one of them"):
+        read_mesh(write(FORK, [tuple(range(8))]))
+    assert len(read_mesh(write(CORNERS, [*SQUARES, (0, 1)])).elements) == 12  # an edge is no face
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "cause"),
+    [
+        ("a.mesh", "MFEM mesh v1.0\n", "is no .mesh file of Medit, but begins with 'MFEM mesh v1.0'"),
+        ("a.mesh", "\n% GETFEM MESH FILE\n", "is no .mesh file of Medit, but begins with '% GETFEM MESH FILE'"),
+        ("a.obj", "L\1\0\0.text", "is no text; compilers use this ending, too"),
+        ("a.obj", "P 0.3 0.3 0.4 10 1 8\n1.0 2.0 3.0\n", "holds no points as OBJ files do"),
+        ("a.off", "4OFF\n1 0 0\n", "begins with '4OFF', not with OFF"),
+        ("a.off", off()[:-12], "holds fewer lines than 8 points and 6 faces"),
+        ("a.node", "1 3 0 0\n1 0 0 0\n", "a.ele is not beside it: copy it there"),
+    ],
+)
+def test_files_of_other_programs_with_an_ending_that_is_read_are_refused_by_name(tmp_path, name, content, cause):
+    (tmp_path / name).write_text(content)
+    with pytest.raises(DatasetError, match=f"{name}: cannot be read as a mesh: {cause}"):
+        read_mesh(tmp_path / name)

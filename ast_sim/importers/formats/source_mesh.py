@@ -29,6 +29,8 @@ SHAPES = {
     "hexahedron": (3, 8),
 }
 
+INSTEAD = "write it as .vtu, .vtk, .msh or .inp"  # what to do with a file of a kind that is not read
+
 BEZIER = "Bezier "  # what the labels of such cells begin with
 
 

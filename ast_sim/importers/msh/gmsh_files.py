@@ -14,9 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ast_sim.importers.formats.gmsh_bytes import Reader, Section
-from ast_sim.importers.formats.gmsh_fields import GmshField, with_fields
 from ast_sim.importers.formats.source_mesh import CellBlock, SourceMesh, node_count
+from ast_sim.importers.msh.gmsh_bytes import Reader, Section
+from ast_sim.importers.msh.gmsh_fields import GmshField, with_fields
 from ast_sim.support.errors import DatasetError
 
 # Gmsh's types of elements.

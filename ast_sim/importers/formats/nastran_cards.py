@@ -1,0 +1,136 @@
+"""The points and elements of decks of Nastran, in one form for all spellings, which meshio reads.
+
+meshio itself loses lines of elements where editors strip blanks, stops at decks without BEGIN BULK or ENDDATA and at
+fields behind the nodes, and knows no included files.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+from ast_sim.importers.formats.source_mesh import INSTEAD
+from ast_sim.support.errors import DatasetError
+
+# Elements of Nastran: the numbers of nodes that they may have, the corners first, and what meshio calls them.
+_ELEMENTS = {
+    "CTETRA": (4, 10),
+    "CPYRAM": (5, 13),
+    "CPYRA": (5, 13),  # as meshio writes it
+    "CPENTA": (6, 15),
+    "CHEXA": (8, 20),
+    "CTRIA3": (3,),
+    "CTRIAR": (3,),
+    "CTRIA6": (3, 6),
+    "CQUAD4": (4,),
+    "CQUADR": (4,),
+    "CQUAD": (4,),
+    "CQUAD8": (4, 8),
+    "CBAR": (2,),
+    "CBEAM": (2,),
+    "CROD": (2,),
+}
+_NAMES = {"CPYRAM": "CPYRA", "CTRIAR": "CTRIA3", "CQUADR": "CQUAD4", "CQUAD": "CQUAD4", "CBAR": "CROD", "CBEAM": "CROD"}
+_OF_CORNERS = {"CTRIA6": "CTRIA3", "CQUAD8": "CQUAD4"}
+
+# Cards of Nastran with the same first letter that are no elements of a volume or a surface.
+_NO_ELEMENTS = re.compile(
+    r"CORD|CONM|CMASS|CELAS|CDAMP|CVISC|CTUBE|CONROD|CFAST|CWELD|CSEAM|CBEND|CBEAM3|CHBDY|CLOAD|CREEP|CAERO|CSUP|CYJOIN"
+    r"|CBUSH|CGAP|CSHEAR|CEND$|CONV|CSET|CLOAD|CSSCHD|CONTACT"
+)
+
+
+def plain_nastran(path: Path) -> bytes:
+    """A deck of Nastran with the points and elements of a deck, and of the files that it includes, alone.
+
+    Raises:
+        DatasetError: it holds points in a system of their own, or elements that are not known, or lacks something; the
+            text names the file and the line.
+    """
+    points, cells = {}, []
+    for place, (card, *fields) in _cards_of_nastran(path):
+        name = card.rstrip("_")
+        wrong = ""
+        if name in ("GRID", "GRDSET") and fields[1] not in ("", "0"):
+            wrong = f"a {name} with a coordinate system of its own, and those are not read"
+        elif name.startswith("C") and name not in _ELEMENTS and not _NO_ELEMENTS.match(name):
+            wrong = f"{name} elements, which are not read"
+        if wrong:
+            raise DatasetError(f"{path}: holds {wrong} ({place}): {INSTEAD}")
+        if name == "GRID":
+            points[fields[0]] = ",".join(["GRID", fields[0], "", *(text or "0." for text in fields[2:5])])
+        elif name in _ELEMENTS:
+            cells += _plain_element(path, place, name, fields)
+    if not points:
+        raise DatasetError(f"{path}: cannot be read as a mesh: holds no GRID, so it is no deck of Nastran; {INSTEAD}")
+    lost = {node for row in cells for node in row.split(",")[1 if row[0] == "+" else 3 :]} - points.keys()
+    if lost:
+        raise DatasetError(f"{path}: an element has the node {min(lost)}, and there is no GRID of this number")
+    return "\n".join(["BEGIN BULK", *points.values(), *cells, "ENDDATA\n"]).encode()
+
+
+def _plain_element(path: Path, place: str, name: str, fields: list[str]) -> list[str]:
+    """The lines of an element: its number, its property, its nodes. Surfaces may lack nodes within their edges."""
+    *_, most = _ELEMENTS[name]
+    nodes = [text for text in fields[2 : 2 + most] if text not in ("", "0")]
+    least = _ELEMENTS[name][0]
+    if name in _OF_CORNERS and len(nodes) < most:
+        nodes = [text for text in fields[2 : 2 + least] if text]
+        name = _OF_CORNERS[name]
+    if len(nodes) not in (least, most) or not all(text.isdigit() for text in nodes):
+        raise DatasetError(
+            f"{path}: {name} {fields[0]} ({place}) has the nodes {', '.join(nodes)}; must have"
+            f" {' or '.join(map(str, _ELEMENTS[name]))}: are lines of the file missing or cut short?"
+        )
+    entries = [fields[0], fields[1] or fields[0], *nodes]
+    rows = [entries[at : at + 8] for at in range(0, len(entries), 8)]
+    return [",".join([_NAMES.get(name, name), *rows[0]]), *(",".join(["+", *row]) for row in rows[1:])]
+
+
+def _cards_of_nastran(path: Path) -> Iterator[tuple[str, list[str]]]:
+    """The cards of the bulk data of a deck: the place, the name and its fields, at least eight.
+
+    A line holds fields of 8 or 16 characters, or between commas. It goes on in the next one, which begins with a blank
+    field, + or *.
+    """
+    rows = list(_rows_of_nastran(path, ()))
+    start = next((number for number, (_, row) in enumerate(rows) if re.match(r"(?i)\s*BEGIN\b", row)), -1)
+    card: list[str] = []
+    first, mark = "", ""
+    for place, row in rows[start + 1 :]:
+        wide = "*" in row.partition(",")[0][:8]
+        size, width = (16, 4) if wide else (8, 8)
+        texts = row.split(",") if "," in row else [row[:8], *(row[at : at + size] for at in range(8, 80, size))]
+        name, *fields = (text.strip() for text in texts)
+        if card and (not name or name[0] in "+*"):
+            if len(name) > 1 and len(mark) > 1 and name[1:] != mark[1:]:
+                raise DatasetError(f"{path}: {place} does not go on with the line before it: sort its lines")
+            card += fields[:width]
+        else:
+            if card:
+                yield first, card + 8 * [""]
+            first, card = place, [name.upper().rstrip("* "), *fields[:width]]
+        if card[0] == "ENDDATA":
+            return
+        mark = fields[width] if len(fields) > width else ""
+        card += [""] * (-(len(card) - 1) % width)
+    if card:
+        yield first, card + 8 * [""]
+
+
+def _rows_of_nastran(path: Path, within: tuple[Path, ...]) -> Iterator[tuple[str, str]]:
+    """The lines of a deck and of the files that it includes, with their places, without comments and empty lines."""
+    for number, line in enumerate(path.read_text("latin-1").expandtabs(8).splitlines(), 1):
+        row = line.partition("$")[0].rstrip()
+        place = f"line {number} of {path.name}" if within else f"line {number}"
+        include = re.fullmatch(r"(?i)\s*INCLUDE\s*[=\s]\s*['\"]?([^'\"]+)['\"]?", row)
+        if include:
+            other = path.parent / include[1].strip().replace("\\", "/")
+            if not other.is_file() or other in (path, *within):
+                raise DatasetError(
+                    f"{[path, *within][-1]}: includes {include[1]} ({place}), which there is not: copy it there"
+                )
+            yield from _rows_of_nastran(other, (path, *within))
+        elif row:
+            yield place, row
