@@ -140,7 +140,21 @@ _CHECKS: dict[str, Callable[[Path], None]] = {
     ".xml": _require_entries_of_dolfin,
     **dict.fromkeys((".off", ".node", ".ele"), _require_first_line),
 }
+
+
+def _plain_med(path: Path) -> bytes:
+    """A MED file without the families that have no groups: meshio looks for their names."""
+    copy = io.BytesIO(path.read_bytes())
+    with contextlib.suppress(OSError, KeyError, AttributeError), h5py.File(copy, "r+") as file:
+        families: Any = file["FAS"]
+        for place in [one[part] for one in families.values() for part in ("ELEME", "NOEUD") if part in one]:
+            for name in [name for name, family in place.items() if "GRO" not in family]:
+                del place[name]
+    return copy.getvalue()
+
+
 _PLAIN: dict[str, Callable[[Path], bytes]] = {
+    ".med": _plain_med,
     ".obj": plain_obj,
     ".off": plain_off,
     ".ply": plain_ply,

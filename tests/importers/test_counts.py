@@ -154,3 +154,9 @@ def test_elements_that_vtk_mistakes_are_refused_in_netcdf_4_as_well(tmp_path):
         file["connect1"].attrs["elem_type"] = np.bytes_("TETRA14")
     with pytest.raises(DatasetError, match=r"a.e: holds TETRA14 elements of 14 nodes, .* with 4, 10 or 15 nodes$"):
         read_mesh(tmp_path / "a.e")
+
+
+def test_elements_of_exodus_that_vtk_does_not_know_are_named(tmp_path):
+    exodus_of(tmp_path / "a.e", "BEX_HEX", 8)
+    with pytest.raises(DatasetError, match="a.e: cannot be read as a mesh: Unsupported element type: BEX_HEX"):
+        read_mesh(tmp_path / "a.e")

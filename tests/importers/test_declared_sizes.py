@@ -130,5 +130,4 @@ def test_arrays_at_the_end_of_a_file_may_be_short(tmp_path):
     writer.SetFileName(str(tmp_path / "a.vtp"))
     writer.SetInputData(pyvista.Cube().triangulate().strip())
     assert writer.Write() == 1
-    with pytest.raises(DatasetError, match="holds cells of VTK's type 6 with [0-9]+ nodes, which are not known here"):
-        read_mesh(tmp_path / "a.vtp")
+    assert len(read_mesh(tmp_path / "a.vtp").elements) == 12

@@ -4,6 +4,7 @@ import re
 import subprocess
 import sys
 
+import h5py
 import numpy as np
 import pytest
 import pyvista
@@ -204,7 +205,11 @@ def off(head="OFF", points=LINES, faces=SQUARES, more=""):
 
 
 def volume(mesh):
-    return np.linalg.det(mesh.points[mesh.elements]).sum() / 6
+    """Of tetrahedra, or within a closed surface."""
+    corners = mesh.points[mesh.elements]
+    if corners.shape[1] == 4:
+        corners = corners[:, 1:] - corners[:, :1]
+    return np.linalg.det(corners).sum() / 6
 
 
 @pytest.mark.parametrize(
@@ -258,6 +263,22 @@ def test_faces_of_more_than_four_corners_are_cut_into_triangles(tmp_path, ending
     assert len(read_mesh(write(CORNERS, [*SQUARES, (0, 1)])).elements) == 12  # an edge is no face
 
 
+@pytest.mark.parametrize("ending", ["vtp", "vtk"])
+def test_polygons_and_strips_of_vtk_are_cut_into_triangles(tmp_path, ending):
+    """A polygon need not be convex; the values of its cell go to its triangles."""
+    strip = [(x, 0, z) for x in range(4) for z in (-1, -2)]
+    surface = pyvista.PolyData(np.array([*FORK, *strip], float), faces=[8, *range(8)], strips=[8, *range(8, 16)])
+    surface.cell_data["E"] = [7.0, 8.0]
+    surface.save(tmp_path / f"a.{ending}")
+    mesh = read_mesh(tmp_path / f"a.{ending}")
+    a, b, c = np.moveaxis(mesh.points[mesh.elements], 1, 0)
+    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+    of_polygon = mesh.fields["cell"]["E"] == 7
+    assert (of_polygon.sum(), (~of_polygon).sum()) == (6, 6)
+    assert areas[of_polygon].sum() == pytest.approx(5) and areas[~of_polygon].sum() == pytest.approx(3)
+    assert "polygons and strips are cut into triangles: 10 more cells" in mesh.notes
+
+
 @pytest.mark.parametrize(
     ("name", "content", "cause"),
     [
@@ -274,3 +295,25 @@ def test_files_of_other_programs_with_an_ending_that_is_read_are_refused_by_name
     (tmp_path / name).write_text(content)
     with pytest.raises(DatasetError, match=f"{name}: cannot be read as a mesh: {cause}"):
         read_mesh(tmp_path / name)
+
+
+def test_families_of_med_need_no_groups(tmp_path):
+    """Gmsh writes such a family for each of its entities that are in no group."""
+    path = of_gmsh(tmp_path, 2.2, name="a.med")
+    with h5py.File(path, "r+") as file:
+        (families,) = file["FAS"].values()
+        assert [name for name in families["ELEME"] if "GRO" not in families["ELEME"][name]] == []
+        families["ELEME"].create_group("FAM_-9_").attrs["NUM"] = -9
+    mesh = read_mesh(path)
+    assert volume(mesh) == pytest.approx(6) and "body" in mesh.groups
+
+
+def test_a_graded_mesh_whose_points_are_numbered_needs_no_search_for_neighbours(tmp_path, monkeypatch):
+    """Where it is fine, thousands of points lie within a millionth of its size."""
+
+    def search(*args):
+        raise AssertionError("points are compared")
+
+    monkeypatch.setattr("ast_sim.importers.solids.stitching.KDTree", search)
+    path = of_gmsh(tmp_path, 2.2)
+    assert volume(read_mesh(path)) == pytest.approx(6)

@@ -8,7 +8,8 @@ text} is the answer if the file is refused, with "missing" if a package is not i
 
 The answer: "steps" (how many frames the file holds), "time", and "pieces". Each piece has the arrays `points` [n, 3],
 `types` [c], `offsets` [c + 1], `connectivity` (VTK's types and order of nodes), `point NAME`, `cell NAME`, `global`,
-`block` (the name of the block that it is), and the sets of nodes of Exodus as `group NAME`.
+`block` (the name of the block that it is), `more` (how many more cells it has than the file, where polygons and strips
+are cut), and the sets of nodes of Exodus as `group NAME`.
 """
 
 from __future__ import annotations
@@ -66,11 +67,14 @@ def _answer(request: dict[str, Any]) -> tuple[dict[str, Any], list[np.ndarray]]:
         head, pieces = {"error": "needs more memory than a file of its size can"}, []
     except ImportError as error:
         head, pieces = {"error": str(error), "missing": error.name}, []
-    except Exception as error:  # also what VTK's Python layer raises
-        head, pieces = {"error": str(error) or type(error).__name__}, []
+    except Refused as error:
+        head, pieces = {"error": str(error)}, []
+    except Exception as error:  # also what VTK's Python layer raises, and arrays that VTK has left as they were
+        head, pieces = {"failed": str(error) or type(error).__name__}, []
     told = [line for line in window.GetOutput().splitlines() if line.strip()]
     if told and "error" not in head:
         head, pieces = {"error": _first_error(told)}, []
+    head = {"error": head["failed"]} if "failed" in head else head
     listed = [{name: (array.dtype.str, array.shape) for name, array in piece.items()} for piece in pieces]
     return {**head, "pieces": listed}, [array for piece in pieces for array in piece.values()]
 

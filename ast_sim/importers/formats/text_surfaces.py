@@ -36,7 +36,7 @@ def _lines_of_obj(path: Path) -> Iterator[str]:
     """The corners and faces of an OBJ file, without textures, normals and colours, without numbers that count from the
     end, and without faces of more than four corners."""
     text = path.read_text("latin-1")
-    if "\0" in text:
+    if "\0" in text[:100]:
         raise DatasetError(f"{path}: cannot be read as a mesh: is no text; compilers use this ending, too")
     points: list[list[float]] = []
     for line in text.replace("\\\n", " ").splitlines():

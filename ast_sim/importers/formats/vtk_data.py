@@ -79,12 +79,19 @@ def _own_time(data: Any) -> float | None:
 
 def arrays_of(block: Block) -> dict[str, np.ndarray]:
     """The arrays of a mesh by name; see `reading_worker`."""
-    from vtkmodules.vtkCommonDataModel import vtkUnstructuredGrid
-    from vtkmodules.vtkFiltersCore import vtkAppendFilter
+    from vtkmodules.vtkCommonDataModel import vtkPolyData, vtkUnstructuredGrid
+    from vtkmodules.vtkFiltersCore import vtkAppendFilter, vtkTriangleFilter
 
     data = block.data
     if block.of_set:
         return {f"group {block.of_set}": _numpy(data.GetCells().GetConnectivityArray()).astype(np.int64)}
+    held = data.GetNumberOfCells()
+    if isinstance(data, vtkPolyData) and (data.GetNumberOfStrips() or data.GetPolys().GetMaxCellSize() > 4):
+        cut = vtkTriangleFilter()
+        cut.SetInputData(data)
+        cut.Update()
+        data = cut.GetOutput()
+    more = data.GetNumberOfCells() - held
     if not isinstance(data, vtkUnstructuredGrid):
         append = vtkAppendFilter()
         append.AddInputData(data)
@@ -93,6 +100,7 @@ def arrays_of(block: Block) -> dict[str, np.ndarray]:
     arrays = {"points": np.zeros((0, 3)), "types": np.zeros(0, np.uint8), "connectivity": np.zeros(0, np.int64)}
     arrays["offsets"] = np.zeros(1, np.int64)
     arrays["block"] = np.array([block.name.encode(errors="replace")])
+    arrays["more"] = np.array([more])
     if data.GetNumberOfPoints():
         arrays["points"] = _numpy(data.GetPoints().GetData())
     if data.GetNumberOfCells():

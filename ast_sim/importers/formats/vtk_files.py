@@ -90,7 +90,9 @@ def vtk_frames(path: Path) -> Iterator[SourceMesh]:
         mesh = _mesh(path, parts, head["time"])
         declared = of_steps[step] if step < len(of_steps) else head.get("declared")
         declared = declared or ([sum(column) for column in zip(*pieces, strict=True)] if pieces else None)
-        _require_counts(mesh, declared)
+        more = sum(int(part["more"][0]) for part in parts if "more" in part)
+        mesh.notes.extend([f"polygons and strips are cut into triangles: {more} more cells"] if more else [])
+        _require_counts(mesh, declared and [declared[0], declared[1] + more])
         if is_dyna(path):
             _require_no_deleted(mesh)
         step += 1

@@ -57,19 +57,16 @@ class Stitching:
             self.pairs = np.stack([order[same], order[same + 1]], axis=1)
             if len(self.pairs):
                 return "ids"
+        count = np.zeros(len(points), np.int64)
+        for block in self.blocks:
+            count += np.bincount(block.nodes.ravel(), minlength=len(points))
+        if mesh.same_point is not None and count.max() > 1:  # the file numbers its points, so two numbers are two
+            return ""
         pairs = KDTree(points[used]).query_pairs(self.tolerance, output_type="ndarray")
         if not len(pairs):
             return ""
         self.pairs = used[pairs]
-        count = np.zeros(len(points), np.int64)
-        for block in self.blocks:
-            count += np.bincount(block.nodes.ravel(), minlength=len(points))
-        if count.max() == 1:
-            return "cut"
-        if mesh.same_point is not None:  # the file numbers its points, and these have two numbers
-            self.pairs = self.pairs[:0]
-            return ""
-        return self._between_parts()
+        return "cut" if count.max() == 1 else self._between_parts()
 
     def _parts(self) -> np.ndarray:
         """[n]: the part of the mesh to which each point belongs, the nodes within edges and faces included."""
