@@ -62,6 +62,22 @@ def test_results_of_calculix_that_say_another_number_are_refused(tmp_path, outpu
             read_mesh(result)
 
 
+def test_results_with_exponents_of_three_digits_are_read(tmp_path):
+    """CalculiX for Windows writes them, and negative numbers are a column wider then."""
+    (tmp_path / "job.inp").write_text(DECK.format("FILE").replace("1, 0, 0, 0\n", "1, -12, 0, 0\n"))
+    subprocess.run(["ccx", "job"], cwd=tmp_path, check=True, capture_output=True)
+    (before,) = vtk_files.vtk_frames(tmp_path / "job.frd")
+    number = re.compile(r"[ ](\d\.\d{5}E[+-])(\d\d)|(-\d\.\d{5}E[+-])(\d\d)")
+    text, changed = number.subn(lambda m: f"{m[1] or m[3]}0{m[2] or m[4]}", (tmp_path / "job.frd").read_text())
+    assert changed > 20
+    (tmp_path / "job.frd").write_text(text)
+    (after,) = vtk_files.vtk_frames(tmp_path / "job.frd")
+    np.testing.assert_array_equal(after.points, before.points)
+    assert after.points.min() == -12
+    for name, values in before.point_fields.items():
+        np.testing.assert_array_equal(after.point_fields[name], values)
+
+
 def exodus(path: Path) -> pyvista.UnstructuredGrid:
     """A block of two bodies and two points of no element."""
     scene = block(2, 1, 1)

@@ -17,9 +17,11 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import resource
 import signal
 import sys
+import tempfile
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -145,12 +147,13 @@ class _Opened:
 @dataclass
 class _Results:
     """An .frd file of CalculiX, the times of its frames, of each time the results that only some nodes have (their
-    names and these nodes), and whether its last increment was given up."""
+    names and these nodes), whether its last increment was given up, and the folder of a copy that is read instead."""
 
     reader: Any
     times: list[float | None]
     partial: dict[float, list[tuple[str, np.ndarray]]]
     facts: dict[str, Any]
+    copy: tempfile.TemporaryDirectory[str] | None
 
     def frame(self, step: int) -> dict[str, np.ndarray]:
         if self.times[step] is not None:
@@ -175,7 +178,8 @@ def _opened(path: Path, changed: int, size: int) -> _Opened | _Results:
 
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # elements that it skips
-            reader = pyvista_frd.FRDReader(path)
+            folder, plain = _plain_frd(path)
+            reader = pyvista_frd.FRDReader(plain)
         (declared, _), results = read_frd_headers(path)
         unseen = [one.time for one in results if not np.isclose(reader.time_values, one.time, rtol=1e-5).any()]
         if unseen:
@@ -186,7 +190,7 @@ def _opened(path: Path, changed: int, size: int) -> _Opened | _Results:
         partial: dict[float, list[tuple[str, np.ndarray]]] = {}
         for result, nodes in partly_given(path, results, declared):
             partial.setdefault(result.time, []).append((result.name, nodes))
-        return _Results(reader, [*reader.time_values] or [None], partial, {"given_up": given_up(path, results)})
+        return _Results(reader, [*reader.time_values] or [None], partial, {"given_up": given_up(path, results)}, folder)
     if ending in _ENDINGS_OF_EXODUS:
         return _exodus(path)
     if path.name.lower().startswith("d3plot") or ending == ".d3plot":
@@ -194,6 +198,19 @@ def _opened(path: Path, changed: int, size: int) -> _Opened | _Results:
     if ending in (".vtkhdf", ".hdf"):
         return _hdf(path)
     return _Opened(_xml_or_legacy(path, ending), [None])
+
+
+def _plain_frd(path: Path) -> tuple[tempfile.TemporaryDirectory[str] | None, Path]:
+    """An .frd file, or a copy if its exponents have three digits, as programs for Windows write them: then negative
+    numbers are a column wider than the format says."""
+    content = path.read_bytes()
+    if not re.search(rb"(?m)^ -1[ \d]{10}(-?\d\.\d{5}E[+-]\d{3}){3}\s*$", content):
+        return None, path
+    folder = tempfile.TemporaryDirectory()
+    copy = Path(folder.name) / path.name
+    number = re.compile(rb"(-?)(\d\.\d+E[+-])0(\d\d)")
+    copy.write_bytes(number.sub(lambda match: (match[1] or b" ") + match[2] + match[3], content))
+    return folder, copy
 
 
 def _xml_or_legacy(path: Path, ending: str) -> Any:
