@@ -141,8 +141,11 @@ class _Assembly:
         Raises:
             DatasetError: some of their nodes belong to no other element.
         """
-        for one in (one for content in scope.contents for one in content.users_own):
-            used = np.concatenate([np.zeros(0, np.int64), *(block.nodes.ravel() for block in self.blocks)])
+        users_own = [one for content in scope.contents for one in content.users_own]
+        if not users_own:
+            return
+        used = np.concatenate([np.zeros(0, np.int64), *(block.nodes.ravel() for block in self.blocks)])
+        for one in users_own:
             places = scope.start + np.flatnonzero(np.isin(scope.numbers, one.nodes))
             alone = len(one.nodes) - np.isin(places, used).sum()
             if alone:

@@ -15,8 +15,8 @@ of bodies that overlap, and where ipctk is not installed, the pairs of Newton st
 
 from __future__ import annotations
 
-import contextlib
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -56,7 +56,8 @@ class TouchingPairs:
 
 
 class ContactForces:
-    """The forces of contact of a scene; made once, because its surfaces do not change.
+    """The forces of contact of a scene; made once, because its surfaces do not change. What finds pairs is made where
+    it is first needed: most scenes have no contact near held nodes.
 
     Args:
         contact_range: the distance below which surfaces push each other, in the unit of length.
@@ -64,17 +65,24 @@ class ContactForces:
 
     Attributes:
         free: [F] the degrees of freedom of the free nodes of deforming bodies.
-        barrier_pairs: of nodes and faces, and of edges; None: ipctk is not installed.
     """
 
     def __init__(self, scene: Scene, contact_range: float, friction: float) -> None:
-        self._range, self._friction = contact_range, friction
-        self._near = NearSurfaces(scene, np.arange(3 * scene.num_nodes))
-        self.barrier_pairs = None
-        with contextlib.suppress(MissingExtra):
-            self.barrier_pairs = _BarrierPairs(scene, contact_range)
+        self._scene, self._range, self._friction = scene, contact_range, friction
         of_soft = np.isin(np.arange(scene.num_nodes), scene.elements[~scene.rigid_elements])
         self.free = np.flatnonzero(np.repeat(of_soft & ~scene.prescribed, 3))
+
+    @cached_property
+    def barrier_pairs(self) -> _BarrierPairs | None:
+        """The pairs of nodes and faces, and of edges; None: ipctk is not installed."""
+        try:
+            return _BarrierPairs(self._scene, self._range)
+        except MissingExtra:
+            return None
+
+    @cached_property
+    def _near(self) -> NearSurfaces:
+        return NearSurfaces(self._scene, np.arange(3 * self._scene.num_nodes))
 
     def pairs(self, position: np.ndarray) -> TouchingPairs:
         """The pairs within the range of contact at positions [N, 3]."""

@@ -5,12 +5,9 @@ import subprocess
 import sys
 
 import pytest
-from simulate.own_assembly.assemblies import write_box
+from simulate.own_assembly.assemblies import case_of, write_box
 
 from ast_sim.cli import main
-from ast_sim.simulate.families import assembly
-from ast_sim.simulate.own_assembly.parameters import completed
-from ast_sim.simulate.own_assembly.spec_reader import read_spec
 from ast_sim.simulate.shapes.cad import gmsh_process
 from ast_sim.simulate.shapes.parts import volumes
 from ast_sim.support.errors import SimulationError
@@ -64,8 +61,7 @@ def write(path, kind: str, text: str = SPEC):
 
 def part(path):
     """The volume of the part, and the notes."""
-    spec = read_spec(path)
-    case = assembly.scene_of(spec, completed(spec.parameters, {}), None, spec.frames).case
+    case = case_of(path)
     rows = case.scene.elements[case.scene.body[case.scene.elements[:, 0]] == 0]
     return volumes(case.scene.rest_position.astype(float), rows).sum(), case.notes()
 

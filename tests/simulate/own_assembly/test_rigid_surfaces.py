@@ -4,13 +4,11 @@ import igl
 import meshio
 import numpy as np
 import pytest
-from simulate.own_assembly.assemblies import write_box
+from simulate.own_assembly.assemblies import case_of, write_box
 
 from ast_sim.importers.shells import find_shells
 from ast_sim.simulate.families import assembly
-from ast_sim.simulate.own_assembly.parameters import completed
 from ast_sim.simulate.own_assembly.rest_check import gap_between
-from ast_sim.simulate.own_assembly.spec_reader import read_spec
 from ast_sim.simulate.shapes.mesh_check import boundary
 
 SPEC = """
@@ -67,11 +65,6 @@ def write(folder, tool, spec=SPEC):
     meshio.Mesh(tool[0], {"triangle": tool[1]}).write(folder / "tool.stl")
     (folder / "SPEC.toml").write_text(spec)
     return folder / "SPEC.toml"
-
-
-def case_of(path):
-    spec = read_spec(path)
-    return assembly.scene_of(spec, completed(spec.parameters, {}), None, spec.frames).case
 
 
 @pytest.mark.parametrize("name", TOOLS)

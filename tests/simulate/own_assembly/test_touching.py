@@ -5,13 +5,11 @@ import sys
 
 import numpy as np
 import pytest
-from simulate.own_assembly.assemblies import box, write_box
+from simulate.own_assembly.assemblies import box, case_of, write_box
 
 from ast_sim.mechanics.quasi_static import quasi_static
 from ast_sim.simulate.families import assembly
-from ast_sim.simulate.own_assembly.parameters import completed
 from ast_sim.simulate.own_assembly.rest_check import gap_between
-from ast_sim.simulate.own_assembly.spec_reader import read_spec
 from ast_sim.simulate.own_assembly.touching import set_back
 from ast_sim.simulate.shapes.mesh import second_order
 from ast_sim.simulate.shapes.parts import quarters
@@ -70,11 +68,10 @@ def folder(tmp_path_factory):
     return path
 
 
-def case_of(folder, low, up, upper=SOFT, size="size = 3"):
+def pair_of(folder, low, up, upper=SOFT, size="size = 3"):
     path = folder / "SPEC.toml"
     path.write_text(SPEC.replace("LOW", low).replace("UPPER", upper).replace("UP", up).replace("SIZE", size))
-    spec = read_spec(path)
-    return assembly.scene_of(spec, completed(spec.parameters, {}), None, spec.frames).case
+    return case_of(path)
 
 
 def meshes(order, shift=0.0):
@@ -135,7 +132,7 @@ def test_parts_that_are_apart_or_pierce_each_other_stay_to_the_bit(shift):
      ("plate.stl", "box.stl"), ("bore.step", "pin4.step")],
 )  # fmt: skip
 def test_cad_parts_that_touch_begin_at_the_contact_distance(low, up, folder):
-    case = case_of(folder, low, up)
+    case = pair_of(folder, low, up)
     (note,) = [note for note in case.notes() if "touch at rest" in note]
     assert DISTANCE <= gap_between(case, (0, 1)) <= 1.1 * DISTANCE
     assert (quarters(case.scene.rest_position.astype(float), case.scene.elements) > 0).all()
@@ -143,14 +140,14 @@ def test_cad_parts_that_touch_begin_at_the_contact_distance(low, up, folder):
 
 
 def test_a_rigid_surface_that_touches_stays(folder):
-    case = case_of(folder, "plate.stl", "box.stl", "rigid = true\nmove = { translation = [0, 0, -0.3] }")
+    case = pair_of(folder, "plate.stl", "box.stl", "rigid = true\nmove = { translation = [0, 0, -0.3] }")
     rest, up = case.scene.rest_position, case.scene.body == 1
     assert rest[up, 2].min() == 5 and DISTANCE <= gap_between(case, (0, 1)) <= 1.1 * DISTANCE
 
 
 def test_a_pin_that_is_thicker_than_its_bore_is_refused_with_a_way_out(folder):
     with pytest.raises(SimulationError, match=r"low and up overlap at rest by .* mm at .*: move one of them by an off"):
-        case_of(folder, "bore.step", "pin4.6.step")
+        pair_of(folder, "bore.step", "pin4.6.step")
 
 
 def test_contact_begins_where_parts_touched(tmp_path):
@@ -158,7 +155,7 @@ def test_contact_begins_where_parts_touched(tmp_path):
     write_box(tmp_path / "low.vtu", (0, 0, 0), (4, 4, 5), (2, 2, 2))
     write_box(tmp_path / "up.vtu", (0, 0, 5), (4, 4, 10), (2, 2, 2))
     move = SOFT.replace("size = 3\n", "").replace("z>10", "zmax")
-    case = case_of(tmp_path, "low.vtu", "up.vtu", move, "")
+    case = pair_of(tmp_path, "low.vtu", "up.vtu", move, "")
     force = assembly.in_newton(quasi_static(case, assembly.SETTINGS), "mm").attributes["reaction"]
     in_series = 16e-6 * 0.3 / (5 / 1e6 + 5 / 2e6)  # N: area times travel over the compliances of two springs
     assert force[0] == pytest.approx(0, abs=1e-9)
