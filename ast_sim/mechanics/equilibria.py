@@ -39,7 +39,8 @@ class Equilibria:
 
     @classmethod
     def of(cls, scene: Scene, law: Law, prescribed_position: np.ndarray, prepared: NewtonSteps) -> Self:
-        """The equilibria of tetrahedra under a law. Bodies are not kept from passing through themselves.
+        """The equilibria of tetrahedra under a law. Bodies are kept from passing through themselves, unless one has a
+        wall or a slit at rest that is thinner than the range of contact.
 
         Args:
             prescribed_position: [S, N, 3], of the prescribed nodes in each frame. Other rows are not read.

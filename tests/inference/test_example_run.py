@@ -44,10 +44,10 @@ def test_it_predicts_a_new_plate_by_one_call_and_better_with_newton_steps(tmp_pa
     told = ["predict", str(tmp_path / "run.ast"), str(data), "--index", "2", "--out", str(tmp_path / "a.h5"), "--check"]
     run.save(tmp_path / "run.ast")
     assert main(told) == 0
-    table = capsys.readouterr().out.splitlines()[-6:]
+    table = capsys.readouterr().out.splitlines()[-7:]
     assert [line.split("  ")[0] for line in table] == [
-        "check", "elements turned over", "deepest penetration", "penetrated volume", "force residual",
-        "balance of reactions",
+        "check", "elements turned over", "elements folded in", "deepest penetration", "penetrated volume",
+        "force residual", "balance of reactions",
     ]  # fmt: skip
 
 

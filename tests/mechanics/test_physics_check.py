@@ -30,8 +30,8 @@ def values(*arguments) -> list:
 
 def test_a_frame_of_the_solver_is_physics(squeezed):
     scene, position, law = squeezed
-    turned, depth, volume, residual, imbalance = values(scene, position[None], [1], law)
-    assert (turned, depth, volume) == (0, 0, 0)
+    turned, folded, depth, volume, residual, imbalance = values(scene, position[None], [1], law)
+    assert (turned, folded, depth, volume) == (0, 0, 0, 0)
     assert residual < 30 and imbalance < 1e-4
 
 
@@ -42,16 +42,16 @@ def test_the_worst_frame_is_named(squeezed):
     moved = position.copy()
     moved[inside, 0] += 1e-3
     found = check_physics(scene, np.stack([position, moved]), [3, 7], law, "m")
-    residual = values(scene, moved[None], [7], law)[3]
+    residual = values(scene, moved[None], [7], law)[4]
     assert residual > 1e4 and found.residual.value == residual
     assert found.residual.frame == 7 and found.imbalance.frame == 7
-    assert f"{residual:.3g}" in str(found).splitlines()[4] and "  7  " in str(found).splitlines()[4]
+    assert f"{residual:.3g}" in str(found).splitlines()[5] and "  7  " in str(found).splitlines()[5]
 
 
 def test_elements_that_are_turned_over_are_counted(squeezed):
     scene, position, law = squeezed
     mirrored = scene.rest_position * np.float32([-1, 1, 1])
-    turned, _, _, residual, imbalance = values(scene, mirrored[None], [1], law)
+    turned, _, _, _, residual, imbalance = values(scene, mirrored[None], [1], law)
     assert turned == scene.num_elements and residual == imbalance == np.inf
 
 
@@ -59,7 +59,7 @@ def test_bodies_that_overlap_share_a_volume(squeezed):
     """The upper block has a base of 140 mm x 140 mm; it comes down by 2 mm of gap and 3 mm more: 58.8 cm^3."""
     scene, _, law = squeezed
     down = scene.rest_position - np.float32([0, 0, 5e-3]) * (scene.body == 1)[:, None].astype(np.float32)
-    _, depth, volume, _, _ = values(scene, down[None], [1], law)
+    _, _, depth, volume, _, _ = values(scene, down[None], [1], law)
     assert depth == pytest.approx(3e-3, rel=1e-3)
     assert volume == pytest.approx(0.14**2 * 3e-3, rel=0.2)  # at its rim the lower block counts nodes whole
 

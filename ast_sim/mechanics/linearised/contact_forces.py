@@ -133,13 +133,27 @@ class ContactForces:
         return sizes, left
 
 
+def free_of_themselves(scene: Scene, contact_range: float) -> tuple[int, ...]:
+    """The bodies that can touch themselves: they deform, and no wall or slit of them is thinner at rest than the range
+    of contact, where its barriers would act. ipctk must be installed."""
+    rest = scene.rest_position.astype(np.float64)
+    surface = scene.surface()
+    free = []
+    for body in np.unique(scene.body[scene.deforming_nodes]).tolist():
+        of_body = surface[scene.body[surface[:, 0]] == body]
+        contact = Contact(rest, of_body, scene.body, ContactSettings(contact_range, 1.0, self_contact=True))
+        contact.collision_free_fraction(rest, rest)
+        free += [body] * contact.at(rest).is_empty
+    return tuple(free)
+
+
 class _BarrierPairs:
     """The pairs on which the solver's barriers act: nodes and faces, and edges."""
 
     def __init__(self, scene: Scene, contact_range: float) -> None:
         rest = scene.rest_position.astype(np.float64)
         surface = scene.surface()
-        settings = ContactSettings(contact_range, 1.0)
+        settings = ContactSettings(contact_range, 1.0, self_contact=free_of_themselves(scene, contact_range))
         self._contact = Contact(rest, surface, scene.body, settings, ~scene.deforming_nodes)
         local = np.unique(surface, return_inverse=True)[1].reshape(-1, 3).astype(np.int32)
         self._edges_and_faces = load_ipctk().edges(local), local

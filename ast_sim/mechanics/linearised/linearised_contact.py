@@ -1,8 +1,8 @@
 """Newton steps with linearised contact: from nearly right positions to equilibrium in a few steps.
 
 At positions x, with K the stiffness, f the derivative of the elastic energy, and each near pair of a surface node and
-a triangle of another body, or of two edges, with its gap g and its outward normal n, a step finds the displacement u of
-the free nodes:
+a triangle of another body, of two edges, or of two places of one body, with its gap g and its outward normal n, a step
+finds the displacement u of the free nodes:
 
     minimise  1/2 u K u + f u   subject to   C u + g >= clearance,
 

@@ -53,6 +53,10 @@ class NearPlaces(NamedTuple):
     normal: np.ndarray
     gap: np.ndarray
 
+    def of(self, rows: np.ndarray) -> NearPlaces:
+        """Some of the pairs."""
+        return NearPlaces(*(values[rows] for values in self))
+
 
 class SurfaceEdges:
     """The edges of a surface [F, 3] at which two faces meet; made once, because its triangles do not change."""
@@ -90,7 +94,7 @@ def passing(one: PlacedEdges, other: PlacedEdges, inside: float, outside: float)
     facing = np.minimum(np.einsum("pi,pi->p", second.outward, normal), -np.einsum("pi,pi->p", first.outward, normal))
     near = (s > 0) & (s < 1) & (t > 0) & (t < 1) & (gap < outside) & (gap > -inside) & (facing > FACING)
     shares = np.stack([1 - s, s, t - 1, -t], axis=1)
-    return NearPlaces(np.concatenate([first.nodes, second.nodes], axis=1)[near], shares[near], normal[near], gap[near])
+    return NearPlaces(np.concatenate([first.nodes, second.nodes], axis=1), shares, normal, gap).of(near)
 
 
 def _near(one: PlacedEdges, other: PlacedEdges, distance: float) -> tuple[PlacedEdges, PlacedEdges]:

@@ -1,22 +1,23 @@
-"""Pairs of a surface node and its nearest place on another body, and of edges that pass each other: how their gaps and
-slips follow the positions."""
+"""Pairs of a surface node and its nearest place on another body, of edges that pass each other, and of places where a
+body touches itself: how their gaps and slips follow the positions."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
 import scipy.sparse
 
-from ast_sim.mechanics.linearised.near_edges import NearPlaces, SurfaceEdges, passing
+from ast_sim.mechanics.linearised.near_edges import NearPlaces, PlacedEdges, SurfaceEdges, passing
+from ast_sim.mechanics.linearised.self_contact import SelfContact
 from ast_sim.scene import Scene
 from ast_sim.support.nearest_surface import nearest_surface
 
 NEAR = 0.5  # pairs with a gap below this may touch, in mean edge lengths of the surfaces
 DEEP = 2.0  # a node deeper inside another body than this is not taken for one in contact with it, in the same
-DEEP_EDGES = 0.2  # the same of two edges: farther in it is not known which side they are on
+SHALLOW = 0.2  # the same of two edges, and of places of one body: farther in it is not known which side they are on
 SLID = 0.02  # surfaces have slid along this last part of the path from rest to x, if nothing else is known
 
 
@@ -59,12 +60,17 @@ class NearSurfaces:
         bodies = np.unique(owner)
         self._surfaces = [(faces[owner == body], nodes[scene.body[nodes] != body]) for body in bodies]
         self._edges = {int(body): SurfaceEdges(faces[owner == body]) for body in bodies}
+        deforming = [body for body in self._edges if body not in scene.rigid_bodies]
+        self._themselves = {body: SelfContact(faces[owner == body], self._rest, self.length) for body in deforming}
         self._may_touch = [pair for pair in combinations(self._edges, 2) if not scene.rigid_bodies.issuperset(pair)]
 
     def pairs(self, position: np.ndarray, stuck: np.ndarray | None = None) -> NearPairs:
         """The pairs that may touch at `position` [N, 3]. They have slid from where they were at `stuck` [N, 3]; if it
         is None, as `SLID` says."""
-        parts = [*self._nodes_and_faces(position), *self._edges_and_edges(position)]
+        edges = {body: edges.at(position) for body, edges in self._edges.items()}
+        parts = [*self._nodes_and_faces(position), *self._edges_and_edges(edges)]
+        for body, itself in self._themselves.items():
+            parts += itself.places(position, edges[body], SHALLOW * self.length, NEAR * self.length)
         if not parts:
             return NearPairs(scipy.sparse.csr_array((0, self._count)), np.zeros(0), np.zeros(0))
         slid = SLID * (position - self._rest) if stuck is None else position - stuck
@@ -84,11 +90,10 @@ class NearSurfaces:
             nodes = np.concatenate([others[nearest.rows, None], nearest.triangles], axis=1)
             yield NearPlaces(nodes, np.insert(shares, 0, 1, axis=1), nearest.normal, nearest.gap)
 
-    def _edges_and_edges(self, position: np.ndarray) -> Iterator[NearPlaces]:
-        """The pairs of edges that pass each other."""
-        edges = {body: edges.at(position) for body, edges in self._edges.items()}
+    def _edges_and_edges(self, edges: Mapping[int, PlacedEdges]) -> Iterator[NearPlaces]:
+        """The pairs of edges of two bodies that pass each other, from the edges by body."""
         for one, other in self._may_touch:
-            yield passing(edges[one], edges[other], DEEP_EDGES * self.length, NEAR * self.length)
+            yield passing(edges[one], edges[other], SHALLOW * self.length, NEAR * self.length)
 
     def _pairs(
         self, nodes: np.ndarray, shares: np.ndarray, normals: np.ndarray, gaps: np.ndarray, slid: np.ndarray
