@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from statistics import median
+from statistics import fmean, median
 from typing import Any, Self
 
 import numpy as np
@@ -19,6 +19,7 @@ from ast_sim.number_arrays import measured_time, percent
 
 TOLERANCES = (0.1, 0.05, 0.025, 0.01, 0.005, 0.002)
 WITHIN = 0.9
+SKEWED = 1.5  # a mean that is this many times the median is told
 RESAMPLES = 2000  # of the bootstrap over scenes
 
 
@@ -46,6 +47,14 @@ class Setting:
     def middle(self) -> float:
         """The median of the seconds."""
         return median(self.seconds)
+
+    @property
+    def time(self) -> str:
+        """The median of the seconds as text, and their mean where that is much larger: in some scenes, such as those
+        that the solver ends, a setting may take far longer than in most."""
+        answered = [seconds for seconds in self.seconds if math.isfinite(seconds)]
+        mean = fmean(answered) if answered else math.inf
+        return measured_time(self.middle) + (f" (mean {measured_time(mean)})" if mean > SKEWED * self.middle else "")
 
 
 @dataclass(frozen=True)
@@ -92,7 +101,7 @@ class TradeRow:
     def cells(self) -> list[str]:
         """The error, the setting of each side, the ratio, the verdict and when it pays, as texts of a table."""
         sides = (self.run, self.solver, *self.others.values())
-        settings = ["none" if one is None else f"{measured_time(one.middle)}: {one.name}" for one in sides]
+        settings = ["none" if one is None else f"{one.time}: {one.name}" for one in sides]
         ratio = "–" if self.ratio is None else f"{self.ratio:.2f} ({self.low:.2f} to {self.high:.2f})"
         pays = "–" if self.pays_after is None else f"{self.pays_after:,} questions"
         return [f"{100 * self.tolerance:g} %", *settings, ratio, self.verdict, pays]
@@ -264,7 +273,7 @@ def _at(errors: Sequence[float]) -> str:
 
 
 def _told(who: str, setting: Setting | None) -> str:
-    return f"{who}: none" if setting is None else f"{who}: {measured_time(setting.middle)} ({setting.name})"
+    return f"{who}: none" if setting is None else f"{who}: {setting.time} ({setting.name})"
 
 
 def _settings(values: Sequence[Mapping[str, Any]]) -> tuple[Setting, ...]:

@@ -7,7 +7,7 @@ import pytest
 from ast_sim import Effort
 from ast_sim.cli import build_parser
 from ast_sim.command_line.effort_options import effort_of
-from ast_sim.inference.effort import EffortErrors, error_with, options_of
+from ast_sim.inference.effort import MOST_NEWTON_STEPS, EffortErrors, error_with, options_of
 from ast_sim.support.errors import ConfigError
 
 DEFAULT = Effort(3, 10)
@@ -25,6 +25,9 @@ def test_options_change_the_default_effort(command):
     assert parsed("--corrections", "1", command=command) == Effort(1, 0)  # no Newton steps where none are asked for
     assert parsed("--newton-steps", "2", command=command) == Effort(3, 2)
     assert parsed("--exact", command=command) == Effort.exact()
+    partly = Effort(3, MOST_NEWTON_STEPS, solved=True, solved_beyond=0.1)
+    assert parsed("--solved-beyond", "0.1", command=command) == partly
+    assert parsed("--solved-beyond", "0.1", "--newton-steps", "2", command=command) == replace(partly, newton_steps=2)
 
 
 def test_a_precision_changes_nothing_else_of_the_default():
@@ -38,6 +41,8 @@ def test_a_precision_changes_nothing_else_of_the_default():
 def test_an_exact_answer_takes_no_numbers():
     with pytest.raises(ConfigError, match="needs no numbers: leave --newton-steps out"):
         parsed("--exact", "--newton-steps", "1")
+    with pytest.raises(ConfigError, match="needs no numbers: leave --solved-beyond out"):
+        parsed("--exact", "--solved-beyond", "0.1")
 
 
 @pytest.mark.parametrize(
@@ -47,6 +52,7 @@ def test_an_exact_answer_takes_no_numbers():
         Effort(2, 0),
         Effort(0, 10),
         Effort.exact(),
+        Effort(1, 10, solved=True, solved_beyond=0.075),
         Effort(1, 2, precision="bfloat16"),
         replace(Effort.exact(), precision="bfloat16"),
     ],

@@ -201,6 +201,20 @@ def test_files_that_have_no_name(run, scene, data, answer, tmp_path):
     ("make", "text"),
     [
         (lambda: Effort(newton_steps=None), "newton_steps is None; it must be a whole number"),
+        (
+            lambda: Effort(newton_steps=1, solved=True, solved_beyond="far"),
+            "solved_beyond is 'far'; it must be a number",
+        ),
+        (
+            lambda: Effort(newton_steps=1, solved=True, solved_beyond=-0.1),
+            "solved_beyond is -0.1; it must be at least 0",
+        ),
+        (
+            lambda: Effort(newton_steps=1, solved=True, solved_beyond=math.nan),
+            "solved_beyond is nan; it must be at most",
+        ),
+        (lambda: Effort(newton_steps=1, solved_beyond=0.1), "solved_beyond says which frames are solved"),
+        (lambda: Effort(solved=True, solved_beyond=0.1), "solved_beyond says which frames are solved"),
         (lambda: Effort(solved="yes"), "solved is 'yes'; it must be True or False"),
         (lambda: Material("young"), "columns is 'young'; it must be a list of names"),
         (lambda: Material(("young", "young")), "two columns of the material have one name"),
@@ -245,7 +259,7 @@ def test_objects_that_cannot_be(make, text):
 def test_whole_numbers_of_numpy_become_plain_ones():
     assert (
         repr(Effort(np.int64(2), np.int32(1)))
-        == "Effort(corrections=2, newton_steps=1, solved=False, precision='float32')"
+        == "Effort(corrections=2, newton_steps=1, solved=False, solved_beyond=0.0, precision='float32')"
     )
 
 

@@ -29,6 +29,17 @@ def test_nine_of_ten_scenes_keep_an_error():
     assert Setting("few", (0.1, 0.2, 0.3), (1.0,) * 3).kept == 0.3
 
 
+def test_a_mean_that_is_much_longer_than_the_median_is_told():
+    errors = (0.0,) * 10
+    assert Setting("even", errors, (0.1,) * 10).time == "100 ms"
+    assert Setting("once", errors, (0.1,) * 9 + (0.5,)).time == "100 ms"  # the mean is 140 ms
+    assert Setting("rare", errors, (0.1,) * 8 + (1.1, 2.1)).time == "100 ms (mean 400 ms)"
+    assert Setting("none", (math.inf,) * 10, (math.inf,) * 10).time.startswith("inf")
+    rare = Setting("rare", errors, (0.1,) * 9 + (2.1,))
+    table = str(TradeFigures(SCENES, (rare,), (setting("own", 0.0, 0.5),)).lines())
+    assert "the run: 100 ms (mean 300 ms) (rare)" in table
+
+
 def test_at_each_error_the_fastest_setting_that_keeps_it_counts_on_both_sides():
     rows = {row.tolerance: row for row in figures().rows()}
     chosen = {

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Self
 from ast_sim.support.argument_checks import require_bool, require_type
 from ast_sim.support.errors import ConfigError
 from ast_sim.support.precisions import Precision, require_precision
-from ast_sim.support.toml_settings import whole
+from ast_sim.support.toml_settings import require_range, whole
 
 if TYPE_CHECKING:
     from ast_sim.models.model_config import ModelConfig
@@ -26,6 +26,7 @@ MOST_NEWTON_STEPS = 10  # by default; they end earlier where one is small
 AGAIN = 2  # corrections that are added where Newton steps did not end: the frame is then predicted again
 STEPS_BEFORE_SOLVER = 1  # more hardly bring it nearer to equilibrium (docs/log.md, 2026-11-27)
 CHOSEN_STEPS = (0, 1, 2, MOST_NEWTON_STEPS)  # among these numbers of Newton steps an effort is chosen
+CHOSEN_MOVES = (0.15, 0.1, 0.075)  # and among these moves beyond which the solver goes on (docs/log.md, 2026-11-29)
 WORTH = 0.05  # a correction or a Newton step must lower an error that is not good by this share
 
 
@@ -45,11 +46,15 @@ class Effort:
             Stress then follows from the material.
         solved: the bundled solver then goes on to its own stop test; with friction, and where bodies still overlap, it
             follows the load path from rest, frame by frame, as if there were no model.
+        solved_beyond: only frames that the Newton steps move away from the model's answer by more than this share of
+            their displacement, or in which they fail, are solved: such an answer was too far from equilibrium to be
+            trusted. 0: all frames.
         precision: in which the model multiplies: "bfloat16" rounds both factors of a product to 8 binary digits, which
             saves time in large scenes on some processors (`ast_sim.ops.products_in`).
 
     Raises:
-        ConfigError: a number is not whole or negative, or there is no such precision.
+        ConfigError: a number is not whole or negative, there is no such precision, or no frame is solved but
+            `solved_beyond` is not 0.
     """
 
     corrections: int = _dial(
@@ -60,6 +65,7 @@ class Effort:
         " decided; 0 with --corrections)"
     )
     solved: bool = False
+    solved_beyond: float = 0.0
     precision: Precision = "float32"
 
     @classmethod
@@ -73,6 +79,10 @@ class Effort:
             require_type(name, count, int, "a whole number")
             object.__setattr__(self, name, count)
         require_bool(solved=self.solved)
+        require_range("solved_beyond", self.solved_beyond, 0)
+        object.__setattr__(self, "solved_beyond", float(self.solved_beyond))
+        if self.solved_beyond and not (self.solved and self.newton_steps):
+            raise ConfigError("solved_beyond says which frames are solved after Newton steps: it needs both")
         require_precision(self.precision)
 
     @property
@@ -84,7 +94,8 @@ class Effort:
         """Such as "2 corrections, up to 1 Newton step, then the solver"."""
         parts = [(self.corrections, "correction"), (self.newton_steps, "Newton step")]
         told = [f"{n} {what}{'' if n == 1 else 's'}" for n, what in parts if n or what == "correction"]
-        ends = [", then the solver"] * self.solved + [f", in {self.precision}"] * (self.precision != "float32")
+        where = f" where they move a frame by more than {100 * self.solved_beyond:g} %" if self.solved_beyond else ""
+        ends = [f", then the solver{where}"] * self.solved + [f", in {self.precision}"] * (self.precision != "float32")
         return ", up to ".join(told) + "".join(ends)
 
     def check(self, config: ModelConfig) -> None:
@@ -138,7 +149,8 @@ def options_of(effort: Effort) -> list[str]:
     precision = ["--precision", effort.precision] * (effort.precision != "float32")
     if replace(effort, precision="float32") == Effort.exact():
         return ["--exact", *precision]
-    return [text for dial in DIALS for text in (option(dial), str(getattr(effort, dial)))] + precision
+    beyond = ["--solved-beyond", f"{effort.solved_beyond:g}"] * (effort.solved_beyond > 0)
+    return [text for dial in DIALS for text in (option(dial), str(getattr(effort, dial)))] + beyond + precision
 
 
 @dataclass(frozen=True)
@@ -218,7 +230,10 @@ def choices(config: ModelConfig, corrections: int) -> tuple[Effort, ...]:
         return ()
     steps = CHOSEN_STEPS if can_make_newton_steps(config) else (0,)
     efforts = tuple(Effort(made, count) for count in steps for made in range(corrections + 1))
-    return (*efforts, Effort.exact()) if can_be_solved(config) and not config.data.rubs else efforts
+    if not can_be_solved(config):
+        return efforts
+    partly = tuple(replace(efforts[-1], solved=True, solved_beyond=move) for move in CHOSEN_MOVES)
+    return (*efforts, *partly) if config.data.rubs else (*efforts, *partly, Effort.exact())
 
 
 def to_measure(config: ModelConfig, corrections: int) -> tuple[Effort, ...]:

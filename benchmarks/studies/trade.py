@@ -48,7 +48,7 @@ ROWS = {
     "plates400": Row("Plates, 400 nodes", "plates", 40, {**DEEP_PLATES, "nodes": 400, "seed": 912}),
     "plates1300": Row("Plates, 1,300 nodes", "plates1300", 15),
     "plates1300_second_order": Row("Plates, 1,300 nodes, second-order", "plates1300_second_order", 15),
-    "parts400": Row("Pairs of parts, 400 nodes, with friction", "parts400_long", 15),
+    "parts400": Row("Pairs of parts, 400 nodes, with friction", "parts400_long", 30),
     "snap_hook": Row("Snap hook, second-order elements, with friction", "snap_hook", 15, beside="snap_hook_transolver"),
     "bumper": Row("Bumper, second-order elements, with friction", "bumper", 15),
 }

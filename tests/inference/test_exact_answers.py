@@ -9,7 +9,8 @@ import ast_sim
 from ast_sim.cli import main
 from ast_sim.inference.effort import choices
 from ast_sim.mechanics.equilibria import Equilibria
-from ast_sim.support.errors import ConfigError
+from ast_sim.mechanics.linearised.linearised_contact import NewtonSteps
+from ast_sim.support.errors import ConfigError, SimulationError
 
 FROM_MODEL = "solved to the stop test of the solver, from the answer of the model"
 ALONG_LOAD_PATH = "solved to the stop test of the solver, along the load path, frame by frame"
@@ -51,6 +52,44 @@ def test_an_exact_answer_ends_where_the_solver_ended(plates):
     assert len(others) == 1
     position, along_load_path = equilibria_of(others[0].scene, answer.law, others[0].position).solve(2, None)
     assert along_load_path and np.abs(position - others[0].position[2]).max() < 1e-6
+
+
+def test_only_frames_that_newton_steps_move_far_are_solved(plates):
+    run = ast_sim.example_run("plates")
+    truth = loaded(plates)[0]
+    steps = ast_sim.Effort(newton_steps=10)
+    stepped, exact = (run.predict(truth, effort=one) for one in (steps, replace(steps, solved=True)))
+    first = run.predict(truth, effort=ast_sim.Effort())
+    free = truth.scene.deforming_nodes & ~truth.scene.prescribed
+    moves = [
+        np.linalg.norm((stepped.position[frame] - first.position[frame])[free])
+        / np.linalg.norm(stepped.displacement[frame][free])
+        for frame in (1, 2)
+    ]
+    far = int(np.argmax(moves)) + 1
+    between = replace(steps, solved=True, solved_beyond=float(np.mean(moves)))
+    answer = run.predict(truth, effort=between)
+    for frame in (1, 2):
+        wanted = exact if frame == far else stepped
+        np.testing.assert_array_equal(answer.position[frame], wanted.position[frame])
+    assert answer.source["solved"] == f"1 of 2 frames {FROM_MODEL}"
+    none = run.predict(truth, effort=replace(between, solved_beyond=1.0))
+    np.testing.assert_array_equal(none.position, stepped.position)
+    assert "solved" not in none.source
+    assert between.text.endswith(f"then the solver where they move a frame by more than {100 * np.mean(moves):g} %")
+
+
+def test_a_frame_whose_newton_steps_fail_is_solved(plates, monkeypatch):
+    run = ast_sim.example_run("plates")
+    truth = loaded(plates)[0]
+
+    def fail(*arguments, **options):
+        raise SimulationError("the stiffness is singular")
+
+    monkeypatch.setattr(NewtonSteps, "step", fail)
+    effort = ast_sim.Effort(newton_steps=1, solved=True, solved_beyond=0.5)
+    answer = run.predict(truth, frames=[1], effort=effort)
+    assert answer.source["solved"] == ALONG_LOAD_PATH and answer.errors(truth)["displacement"] < 1e-5
 
 
 def test_a_poor_start_makes_the_solver_go_the_way_of_the_load(plates, monkeypatch):

@@ -28,7 +28,7 @@ def test_efforts_and_variants_are_measured_on_the_same_scene(plates, tmp_path, c
     by_quantity = json.loads((tmp_path / "pages" / "trade.json").read_text())
     assert list(by_quantity) == ["displacement", "reaction", "stress"]
     figures = by_quantity["displacement"]
-    assert [len(figures[side]) for side in ("run", "solver")] == [5, len(VARIANTS)]
+    assert [len(figures[side]) for side in ("run", "solver")] == [8, len(VARIANTS)]
     own = next(one for one in figures["solver"] if one["name"] == "own stop test")
     assert own["errors"][0] < 1e-3 and own["seconds"][0] > 0
     (mesh,) = figures["mesh_errors"]  # a plate of 200 nodes is thin, and too stiff

@@ -125,7 +125,8 @@ def _predicted(
                 if not effort.solved:
                     bar.advance(frame.name)
             for frame in frames if effort.solved else ():
-                frame.solve()
+                if frame.moved(effort.corrections) >= effort.solved_beyond:
+                    frame.solve()
                 bar.advance(frame.name)
     return scenes
 

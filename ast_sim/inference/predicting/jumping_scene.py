@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -113,6 +114,17 @@ class JumpingFrame:
             self.failure = f"{self.name}: a Newton step failed: {error}"
         self.seconds += time.perf_counter() - began
 
+    def moved(self, corrections: int) -> float:
+        """How far the Newton steps have moved the model's answer after these corrections, as a share of the
+        displacement of the free nodes; infinite where a step has failed."""
+        if self.failure is not None:
+            return math.inf
+        scene = self.scene.question.scene
+        free = scene.deforming_nodes & ~scene.prescribed
+        end = _array(self.positions[-1])[free]
+        move = np.linalg.norm(end - _array(self.positions[corrections])[free])
+        return float(move / max(np.linalg.norm(end - scene.rest_position[free]), np.finfo(float).tiny))
+
     def solve(self) -> None:
         """Have the solver go on to its stop test, from where the Newton steps have ended, if they have not failed."""
         if not self.positions:  # the model has failed
@@ -208,7 +220,8 @@ def _solved(frames: Sequence[JumpingFrame]) -> dict[str, str]:
     if not solved:
         return {}
     path = "along the load path, frame by frame" if any(solved) else "from the answer of the model"
-    return {"solved": f"solved to the stop test of the solver, {path}"}
+    some = "" if len(solved) == len(frames) else f"{len(solved)} of {len(frames)} frames "
+    return {"solved": f"{some}solved to the stop test of the solver, {path}"}
 
 
 def _array(positions: Tensor) -> np.ndarray:
