@@ -103,10 +103,31 @@ def is_closed(triangles: np.ndarray) -> bool:
     return bool((np.unique(triangle_sides(triangles), axis=0, return_counts=True)[1] == 2).all())
 
 
+def vector_areas(corners: np.ndarray) -> np.ndarray:
+    """[F, 3]: the normals of triangles with these corners [F, 3, 3], as long as their areas."""
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
+
+
 def unit_normals(corners: np.ndarray) -> np.ndarray:
     """[F, 3] of length one, for triangles with these corners [F, 3, 3]; 0 for a triangle without an area."""
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), np.finfo(normal.dtype).tiny)
+    return _of_length_one(vector_areas(corners))
+
+
+def node_areas(position: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """[N, 3]: a third of the vector areas of the faces [F, 3] around each node, at positions [N, 3]."""
+    areas = np.zeros_like(position)
+    np.add.at(areas, faces, vector_areas(position[faces])[:, None] / 3)
+    return areas
+
+
+def node_normals(position: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """[N, 3]: the unit normals of a surface [F, 3] at its nodes; 0 at other ones."""
+    return _of_length_one(node_areas(position, faces))
+
+
+def _of_length_one(vectors: np.ndarray) -> np.ndarray:
+    """Vectors [n, 3] divided by their lengths; 0 stays 0."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), np.finfo(vectors.dtype).tiny)
 
 
 def equal_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

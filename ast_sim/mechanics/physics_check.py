@@ -11,7 +11,7 @@ from itertools import combinations
 
 import numpy as np
 
-from ast_sim.element_topology import signed_volumes
+from ast_sim.element_topology import node_areas, signed_volumes, unit_normals
 from ast_sim.material import FRICTION, Material
 from ast_sim.mechanics.contact_and_friction import ContactSettings, load_ipctk
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean
@@ -204,7 +204,7 @@ def _overlap(scene: Scene, position: np.ndarray) -> tuple[float, float]:
     owner = scene.body[surface[:, 0]]
     faces = {body: surface[owner == body] for body in np.unique(owner).tolist()}
     rigid = scene.rigid_bodies
-    areas = _vector_areas(position, surface)
+    areas = node_areas(position, surface)
     deepest = total = 0.0
     for one, other in combinations(faces, 2):
         if rigid >= {one, other}:
@@ -214,24 +214,10 @@ def _overlap(scene: Scene, position: np.ndarray) -> tuple[float, float]:
             nodes, depths, nearest = nodes_inside(position, faces[mine], faces[theirs])
             if len(nodes):
                 deepest = max(deepest, float(depths.max()))
-                normal = _normals(position, faces[theirs][nearest])
-                normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), np.finfo(float).tiny)
+                normal = unit_normals(position[faces[theirs][nearest]])
                 volumes.append(float(depths @ np.maximum(0, -np.einsum("ni,ni->n", areas[nodes], normal))))
         total += max(volumes)
     return deepest, total
-
-
-def _normals(position: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """[F, 3]: the outward normals of triangles [F, 3], as long as their areas."""
-    a, b, c = (position[triangles[:, corner]] for corner in range(3))
-    return np.cross(b - a, c - a) / 2
-
-
-def _vector_areas(position: np.ndarray, surface: np.ndarray) -> np.ndarray:
-    """[N, 3]: a third of the normals of the triangles around each node."""
-    areas = np.zeros_like(position)
-    np.add.at(areas, surface.ravel(), np.repeat(_normals(position, surface) / 3, 3, axis=0))
-    return areas
 
 
 class _Balance:

@@ -19,7 +19,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import cg
 
-from ast_sim.element_topology import linear_elements
+from ast_sim.element_topology import linear_elements, node_normals
 from ast_sim.mechanics.driven import Driven
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean
 from ast_sim.mechanics.elements.second_order import elastic_body
@@ -155,7 +155,7 @@ class Reaction:
         have come nearer: there the body may touch itself."""
         from scipy.spatial import KDTree
 
-        outward = self._outward(position)
+        outward = node_normals(position, np.concatenate(list(self._surfaces.values())))
         pairs = [np.zeros((0, 2), int)]
         for faces in self._surfaces.values():
             nodes = np.unique(faces)
@@ -170,14 +170,6 @@ class Reaction:
         opposite = np.einsum("pi,pi->p", outward[first], outward[second]) < OPPOSITE
         nearer = np.linalg.norm(between, axis=1) < np.linalg.norm(before, axis=1)
         return np.stack([first, second])[:, facing & opposite & nearer]
-
-    def _outward(self, position: np.ndarray) -> np.ndarray:
-        """[N,3] the outward unit normals at the nodes of the surfaces; zero at all other nodes."""
-        faces = np.concatenate(list(self._surfaces.values()))
-        outward = np.zeros_like(position)
-        a, b, c = (position[faces[:, corner]] for corner in range(3))
-        np.add.at(outward, faces.ravel(), np.repeat(np.cross(b - a, c - a), 3, axis=0))
-        return outward / np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), np.finfo(float).tiny)
 
     def _field(self, source: np.ndarray, sink: np.ndarray, folds: np.ndarray) -> np.ndarray:
         """[N] w: about harmonic between 1 at the sources and 0 at the sinks, and the same on both sides of folds."""

@@ -7,6 +7,7 @@ import pytest
 from meshes import box_between
 from solids import scene_of
 
+from ast_sim.element_topology import node_areas, node_normals, surface_triangles
 from ast_sim.material import Material
 from ast_sim.mechanics.case import SolidCase
 from ast_sim.mechanics.contact_and_friction import ContactSettings
@@ -130,3 +131,19 @@ def test_elements_that_lie_in_another_part_of_their_body_are_counted(inside_out)
     inside = (x > 0.02) & (((z > 0.01) & (z < 0.02)) | ((z > 0.03) & (z < 0.04)))
     assert check.folded.value == pytest.approx(inside.sum(), rel=0.1) and check.folded.frame == 4
     assert "inside another part of their own body" in str(check)
+
+
+def test_the_areas_of_nodes_add_up_and_their_normals_point_out():
+    position, elements = box_between((3, 2, 4), (0, 0, 0), (0.3, 0.2, 0.5))
+    faces = surface_triangles(position, elements)
+    areas, normals = node_areas(position, faces), node_normals(position, faces)
+    np.testing.assert_allclose(areas.sum(axis=0), 0, atol=1e-15)
+    top = np.isclose(position[:, 2], 0.5)
+    assert areas[top, 2].sum() == pytest.approx(0.3 * 0.2)
+    edge = np.isclose(position[:, :2], [[0.3, 0.2]]).any(axis=1) | np.isclose(position[:, :2], 0).any(axis=1)
+    np.testing.assert_allclose(normals[top & ~edge], [[0, 0, 1]] * (top & ~edge).sum())
+    inner = np.setdiff1d(np.arange(len(position)), faces)
+    assert len(inner) and not normals[inner].any()
+    outer = np.unique(faces)
+    np.testing.assert_allclose(np.linalg.norm(normals[outer], axis=1), 1)
+    assert (np.einsum("ni,ni->n", normals, position - [0.15, 0.1, 0.25])[outer] > 0).all()

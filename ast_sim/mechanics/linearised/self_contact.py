@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.spatial import KDTree
 
-from ast_sim.element_topology import triangle_sides, unit_normals
+from ast_sim.element_topology import node_normals, triangle_sides, unit_normals
 from ast_sim.mechanics.linearised.near_edges import NearPlaces, PlacedEdges, passing
 from ast_sim.support.nearest_surface import near_boxes
 
@@ -32,13 +32,13 @@ class SelfContact:
     def __init__(self, faces: np.ndarray, rest: np.ndarray, length: float) -> None:
         self._faces, self._rest, self._apart = faces, rest, APART * length
         self._nodes = np.unique(faces)
-        self._outward = _node_normals(faces, rest)
+        self._outward = node_normals(rest, faces)
         sides = rest[triangle_sides(faces)]
         self._longest = float(np.linalg.norm(sides[:, 1] - sides[:, 0], axis=1).max())
 
     def places(self, position: np.ndarray, edges: PlacedEdges, inside: float, outside: float) -> Iterator[NearPlaces]:
         """The pairs with a gap between -inside and outside at positions [N, 3], where the body has these edges."""
-        outward = _node_normals(self._faces, position)
+        outward = node_normals(position, self._faces)
         folded = self._folded(position, outward, outside)
         if not folded.any():
             return
@@ -89,10 +89,3 @@ def _facing(faces: np.ndarray, position: np.ndarray, outward: np.ndarray, inside
     shares = np.insert(-np.asarray(below), 0, 1, axis=1)
     of_pair = np.concatenate([nodes[node, None], faces[face]], axis=1)
     return NearPlaces(of_pair, shares, normals[face], gap).of((shares[:, 1:] <= 0).all(axis=1))
-
-
-def _node_normals(faces: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """[N, 3]: the mean normals of the nodes of faces [F, 3] at positions [N, 3], with a length of 1; 0 elsewhere."""
-    normals = np.zeros_like(position)
-    np.add.at(normals, faces, unit_normals(position[faces])[:, None])
-    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(float).tiny)
