@@ -20,6 +20,10 @@ from ast_sim.mechanics.quasi_static import SolidFrames
 from ast_sim.mechanics.solver import SolverSettings
 from ast_sim.scene import Scene
 
+# Where a part snaps over, its energy falls for a hundred iterations. Halved load steps would only meet the same fall,
+# or lead to another equilibrium.
+SNAPPING = SolverSettings(max_iterations=200)
+
 
 class Equilibria:
     """Equilibria of a case; made once for each scene and motion.
@@ -30,7 +34,7 @@ class Equilibria:
         settings: tolerances.
     """
 
-    def __init__(self, case: SolidCase, prepared: NewtonSteps, settings: SolverSettings | None = None) -> None:
+    def __init__(self, case: SolidCase, prepared: NewtonSteps, settings: SolverSettings = SNAPPING) -> None:
         self._frames = SolidFrames(case, settings, prepared)
         self._last_frame = 0  # that is solved along the load path
         self._reached = case.scene.rest_position.astype(np.float64)

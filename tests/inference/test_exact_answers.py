@@ -8,8 +8,10 @@ import pytest
 import ast_sim
 from ast_sim.cli import main
 from ast_sim.inference.effort import choices
+from ast_sim.material import Material
 from ast_sim.mechanics.equilibria import Equilibria
 from ast_sim.mechanics.linearised.linearised_contact import NewtonSteps
+from ast_sim.mechanics.physics_check import Law
 from ast_sim.support.errors import ConfigError, SimulationError
 
 FROM_MODEL = "solved to the stop test of the solver, from the answer of the model"
@@ -52,6 +54,18 @@ def test_an_exact_answer_ends_where_the_solver_ended(plates):
     assert len(others) == 1
     position, along_load_path = equilibria_of(others[0].scene, answer.law, others[0].position).solve(2, None)
     assert along_load_path and np.abs(position - others[0].position[2]).max() < 1e-6
+
+
+def test_a_pair_of_parts_that_snaps_ends_where_the_solver_ended(tmp_path):
+    """With 60 iterations a step, which is enough elsewhere, the last frame of this pair is given up after 500."""
+    path = tmp_path / "pairs.h5"
+    ast_sim.generate("abcd", path, train=0, valid=5, test=0, nodes=400, keep=(10, 15, 20), seed=11, progress=False)
+    with ast_sim.Dataset(path) as data:
+        truth = data["valid"][4]
+    law = Law(Material(("young", "poisson"), {"friction": truth.attributes["friction"]}), truth.attributes["dhat"])
+    position, _ = equilibria_of(truth.scene, law, truth.position).solve(3, None)
+    displacement = np.linalg.norm(truth.position[3] - truth.scene.rest_position)
+    assert np.linalg.norm(position - truth.position[3]) < 1e-3 * displacement
 
 
 def test_only_frames_that_newton_steps_move_far_are_solved(plates):
