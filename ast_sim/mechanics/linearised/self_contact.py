@@ -87,5 +87,6 @@ def _facing(faces: np.ndarray, position: np.ndarray, outward: np.ndarray, inside
         return NearPlaces(np.zeros((0, 4), int), np.zeros((0, 4)), np.zeros((0, 3)), gap)
     below = igl.barycentric_coordinates(points[node], *(np.ascontiguousarray(corners[face, i]) for i in range(3)))
     shares = np.insert(-np.asarray(below), 0, 1, axis=1)
+    above: np.ndarray = np.all(shares[:, 1:] <= 0, axis=1)  # not beside it
     of_pair = np.concatenate([nodes[node, None], faces[face]], axis=1)
-    return NearPlaces(of_pair, shares, normals[face], gap).of((shares[:, 1:] <= 0).all(axis=1))
+    return NearPlaces(of_pair, shares, normals[face], gap).of(above)
