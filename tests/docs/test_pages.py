@@ -2,7 +2,8 @@
 
 A page's blocks of Python run one after the other as one program, in a folder of its own. A comment on the line before a
 block changes that: `<!-- test: slow -->` for one that takes over a minute, which is compiled only, and what it would
-have made, `plates.h5` and `run`, is there already, but small; `<!-- test: fragment -->` for one that is no program.
+have made, `plates.h5` and the runs `run` and `better`, is there already, but small; `<!-- test: fragment -->` for one
+that is no program.
 """
 
 import itertools
@@ -81,13 +82,14 @@ def with_blocks(kinds: tuple[str, ...]) -> list[Path]:
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory) -> Path:
-    """A folder with a small `plates.h5` and a `run` that was trained on it for a moment."""
+    """A folder with a small `plates.h5`, a `run` that was trained on it for a moment, and the same run as `better`."""
     folder = tmp_path_factory.mktemp("made")
     data, run = str(folder / "plates.h5"), str(folder / "run")
     few = shlex.split("--count 2 --valid 1 --test 1 --nodes 150 --frames 6 --workers 1")
     assert main(["generate", "deforming_plate", "--out", data, *few]) == 0
     settings = ["train.steps=4", "train.statistics_pairs=4", "train.batch_size=2"]
     assert main(["train", data, "--out", run, *(word for setting in settings for word in ("--set", setting))]) == 0
+    shutil.copytree(run, folder / "better")
     return folder
 
 
