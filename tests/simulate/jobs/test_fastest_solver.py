@@ -1,6 +1,8 @@
 """The solver at one frame, beside which a model is judged: real solves of tiny scenes in real worker processes."""
 
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,6 +28,13 @@ from ast_sim.support.errors import ConfigError, DatasetError, SimulationError
 
 OWN, LOOSER = SolverVariant("own stop test"), SolverVariant("10x looser", tolerance=10)
 SETTINGS = {"seed": 5, "nodes": 150, "frames": 9, "workers": 1, "progress": False}
+
+
+def test_pages_state_the_number_of_variants():
+    docs = Path(__file__).parents[3] / "docs"
+    for page in ("how-to/choose-effort.md", "reference/solver.md"):
+        counts = re.findall(r"(\d+) (?:variants|settings of the solver)", (docs / page).read_text(encoding="utf-8"))
+        assert counts == [str(len(VARIANTS))], page
 
 
 @pytest.fixture(scope="module")
