@@ -154,7 +154,7 @@ class DeepestFrames:
         scenes: each scene.
         relative_error, stress_share, largest_stress, by_calls: means over the scenes that did not fail.
         seconds: the median of the answers' seconds.
-        unsettled: how many scenes had Newton steps that did not end.
+        not_converged: the number of scenes whose Newton steps have not converged.
         solver: beside the solver at its own stop test; None: it was not run.
         cheapest: beside its fastest variant that is at least as accurate; None: likewise.
         no_solver: why the solver was not run; None: it was, or nobody asked.
@@ -166,7 +166,7 @@ class DeepestFrames:
     largest_stress: float | None
     by_calls: tuple[float, ...]
     seconds: float | None
-    unsettled: int
+    not_converged: int
     solver: Beside | None
     cheapest: Beside | None
     no_solver: str | None

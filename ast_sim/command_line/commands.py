@@ -231,7 +231,8 @@ def predict(args: argparse.Namespace) -> None:
     if truth is not None and not moves:
         answer = run.predict(truth, num_frames=args.num_frames, name=name, **wanted)
     else:
-        scene, truth = (_scene(args) if truth is None else truth.scene), None
+        scene = _scene(args) if truth is None else truth.scene
+        truth = None
         answer = run.predict(scene, moves, num_frames=args.num_frames, name=name, **wanted)
     _save(answer, args, truth)
 
@@ -276,8 +277,8 @@ def sweep(args: argparse.Namespace) -> None:
     )
     swept.save(args.out)
     print(f"{args.out}: {len(swept.rows)} rows, {measured_time(swept.seconds / len(swept.rows))} each")
-    if swept.unsettled:
-        print(f"not converged: {swept.unsettled} of {len(swept.rows)} rows, where last_newton_step is too large")
+    if swept.not_converged:
+        print(f"not converged: {swept.not_converged} of {len(swept.rows)} rows, where last_newton_step is too large")
     if swept.varied:
         swept.picture(picture, args.quantity)
         print(f"picture: {picture}")

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 GOOD = 0.02  # a relative error that most users call exact
 GOOD_STRESS = 0.1  # the same of the stress, relative to the error of its mean
 MOST_NEWTON_STEPS = 10  # by default; they end earlier where one is small
-AGAIN = 2  # corrections that are added where Newton steps did not end: the frame is then predicted again
+AGAIN = 2  # corrections that are added where Newton steps have not converged: the frame is then predicted again
 STEPS_BEFORE_SOLVER = 1  # more hardly bring it nearer to equilibrium (docs/log.md, 2026-11-27)
 CHOSEN_STEPS = (0, 1, 2, MOST_NEWTON_STEPS)  # among these numbers of Newton steps an effort is chosen
 CHOSEN_MOVES = (0.15, 0.1, 0.075)  # and among these moves beyond which the solver goes on (docs/log.md, 2026-11-29)
@@ -162,7 +162,7 @@ class EffortErrors:
         error: of the displacement, relative to it; None: the prediction failed.
         stress_error: of the stress, relative to the error of the frame's true mean; None: there is no stress.
         steps: the Newton steps that were made.
-        unsettled: the share of the scenes in which the Newton steps did not end.
+        unsettled: the share of the scenes in which the Newton steps have not converged.
     """
 
     effort: Effort
@@ -264,6 +264,6 @@ def cheapest_good(measured: Sequence[EffortErrors]) -> Effort:
     accurate = [one for one, error in errors.items() if error <= enough]
     both = [one for one in accurate if stresses[one] <= enough_stress]
     good = both or accurate
-    ended = min(one.unsettled for one in good)
-    settled = [one for one in good if one.unsettled <= ended]
-    return min(settled, key=lambda one: (one.effort.corrections + one.steps, one.effort.corrections)).effort
+    fewest = min(one.unsettled for one in good)
+    converged = [one for one in good if one.unsettled <= fewest]
+    return min(converged, key=lambda one: (one.effort.corrections + one.steps, one.effort.corrections)).effort

@@ -44,7 +44,7 @@ class Sweep:
     seconds: float
 
     @property
-    def unsettled(self) -> int:
+    def not_converged(self) -> int:
         """The number of rows whose Newton steps have not converged."""
         return sum(row.get("last_newton_step", 0.0) > STILL for row in self.rows)
 
@@ -97,7 +97,10 @@ def sweep(
     needs_load_path = config.data.rubs and effort.newton_steps > 0
     frames = None if needs_load_path or config.scheme.follows_motion else 2
     choice = {"effort": effort} if error is None else {"error": error}
-    table, seconds, notes, unpromised = [], 0.0, [], 0
+    table = []
+    seconds = 0.0
+    notes = []
+    unpromised = 0
     with Progress(len(rows), "rows", progress) as bar:
         for start in range(0, len(rows), TOGETHER):
             questions = ask(spec, rows[start : start + TOGETHER], scope, trained, frames, nodes)

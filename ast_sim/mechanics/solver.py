@@ -172,7 +172,7 @@ class Newton:
             self._equilibrate()
         self.dissipation += self.state.contact.dissipation()
 
-    def settle(self, position: np.ndarray, stuck: np.ndarray | None = None) -> None:
+    def equilibrate_near(self, position: np.ndarray, stuck: np.ndarray | None = None) -> None:
         """Find the equilibrium near positions [N,3] at which the prescribed nodes already are.
 
         The equilibrium without friction comes first: far from equilibrium, normal forces may be far too large, and

@@ -209,8 +209,8 @@ def _section(found: dict[str, Any]) -> list[str]:
         "",
         f"## {found['row']['title']}",
         "",
-        f"{Effort(**found['effort']).text}. {over_the_scenes(found['scenes'])} The Newton steps did not end in"
-        f" {found['unsettled']} of {len(found['scenes'])} scenes.",
+        f"{Effort(**found['effort']).text}. {over_the_scenes(found['scenes'])} The Newton steps have not converged in"
+        f" {found['not_converged']} of {len(found['scenes'])} scenes.",
         *([curve_line(found["training"])] if found["training"] else []),
     ]
 

@@ -246,10 +246,10 @@ def _percent(errors: list[float | None]) -> str:
 
 def _section(found: dict[str, Any]) -> list[str]:
     lines = ["", f"## {found['row']['title']}", "", over_the_scenes(found["scenes"])]
-    unsettled = [scene["name"] for scene in found["scenes"] if (scene["last_step"] or 0) > STILL]
-    if unsettled:
-        share = f"{len(unsettled)} of {len(found['scenes'])} scenes"
-        lines.append(f"The Newton steps did not end in {share}: {', '.join(unsettled)}.")
+    not_converged = [scene["name"] for scene in found["scenes"] if (scene["last_step"] or 0) > STILL]
+    if not_converged:
+        share = f"{len(not_converged)} of {len(found['scenes'])} scenes"
+        lines.append(f"The Newton steps have not converged in {share}: {', '.join(not_converged)}.")
     if found["stress_share"] is not None:
         lines.append(
             f"Stress: the error is {found['stress_share']:.2f} times the standard deviation of the true stress; the"

@@ -220,8 +220,8 @@ def test_newton_steps_end_when_one_is_small(pressed, monkeypatch):
     assert short.converged is False and short.last_steps == (pytest.approx(sizes[0], rel=1e-3),)
     assert answers(model, question, Effort(1))[0].converged is None
     found = deepest_frames(model, pressed, "test", Effort(1, 1))
-    assert found.unsettled == 1 and "in 1 of 1 scenes the Newton steps did not end" in "\n".join(lines(found))
-    assert deepest_frames(model, pressed, "test", Effort(1, 6)).unsettled == 0
+    assert found.not_converged == 1 and "in 1 of 1 scenes the Newton steps have not converged" in "\n".join(lines(found))
+    assert deepest_frames(model, pressed, "test", Effort(1, 6)).not_converged == 0
 
 
 def test_a_quiet_prediction_says_nothing_of_newton_steps_that_take_long(pressed, monkeypatch, capfd):
@@ -250,7 +250,7 @@ def test_the_default_effort_is_the_cheapest_that_is_good():
     assert cheapest_good(measured(errors, None, steps, ended)) == Effort(2, 3)  # 3.7 together; 3.8 after one
     steps[1, 3] = 2.6
     assert cheapest_good(measured(errors, None, steps, ended)) == Effort(1, 3)
-    ended[1, 3] = 0.1  # in one scene of ten the steps did not end
+    ended[1, 3] = 0.1  # in one scene of ten the steps have not converged
     assert cheapest_good(measured(errors, None, steps, ended)) == Effort(2, 3)
     ended[2, 3] = 0.1
     assert cheapest_good(measured(errors, None, steps, ended)) == Effort(1, 3)

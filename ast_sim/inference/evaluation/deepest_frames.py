@@ -71,7 +71,7 @@ def deepest_frames(
         largest_stress=_mean([scene.largest_stress for scene in known]),
         by_calls=tuple(np.mean([scene.by_calls for scene in known], axis=0).tolist()) if known else (),
         seconds=statistics.median(scene.seconds for scene in known) if known else None,
-        unsettled=sum((scene.last_step or 0) > STILL for scene in known),
+        not_converged=sum((scene.last_step or 0) > STILL for scene in known),
         solver=_beside([(scene, scene.solver.seconds) for scene in known if scene.solver]),
         cheapest=_beside([(scene, scene.solver.cheapest_seconds) for scene in known if scene.solver]),
         no_solver=why,
@@ -152,8 +152,8 @@ def lines(frames: DeepestFrames) -> list[str]:
     ]
     if len(after) > 1:
         told.append(f"  after each call, and each Newton step: {', '.join(after)} %")
-    if frames.unsettled:
-        told.append(f"  in {frames.unsettled} of {len(frames.scenes)} scenes the Newton steps did not end")
+    if frames.not_converged:
+        told.append(f"  in {frames.not_converged} of {len(frames.scenes)} scenes the Newton steps have not converged")
     if frames.stress_share is not None and frames.largest_stress is not None:
         told.append(
             f"  stress: {frames.stress_share:.2f} of the error of the frame's true mean; the largest is"

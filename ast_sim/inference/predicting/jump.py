@@ -120,7 +120,7 @@ def _predicted(
             # In ascending order, whatever the domains: with friction a frame needs to know the one before.
             for frame in frames if effort.newton_steps else ():
                 frame.refine(effort.newton_steps, each_step, bar)
-                if not each_step and effort.newton_steps >= MOST_NEWTON_STEPS and frame.unsettled:
+                if not each_step and effort.newton_steps >= MOST_NEWTON_STEPS and frame.not_converged:
                     _start_again(model, frame, effort, bar)
                 if not effort.solved:
                     bar.advance(frame.name)
@@ -133,12 +133,14 @@ def _predicted(
 
 def _start_again(model: Simulator, frame: JumpingFrame, effort: Effort, progress: Progress) -> None:
     """Newton steps need a nearly right start: more corrections give a better one."""
-    first, spent = (frame.positions, frame.fields, frame.last_step), frame.seconds
+    first = (frame.positions, frame.fields, frame.last_step)
+    spent = frame.seconds
     _predict(model, [frame], replace(effort, corrections=effort.corrections + AGAIN))
     frame.refine(effort.newton_steps, False, progress)
     frame.seconds += spent
     if frame.failure is not None:  # the first answer at least says that it has not converged
-        frame.failure, (frame.positions, frame.fields, frame.last_step) = None, first
+        frame.failure = None
+        (frame.positions, frame.fields, frame.last_step) = first
 
 
 def _waves(scenes: Sequence[JumpingScene]) -> Iterator[list[JumpingFrame]]:
@@ -185,4 +187,7 @@ def _predict(model: Simulator, group: list[JumpingFrame], effort: Effort) -> Non
         return
     for frame, (positions, fields, latent, seconds) in zip(group, predicted, strict=True):
         frame.failure = not_finite(model.config, frame.scene.question.name, frame.number, positions[-1], fields)
-        frame.positions, frame.fields, frame.latent, frame.seconds = positions, [fields], latent, seconds
+        frame.positions = positions
+        frame.fields = [fields]
+        frame.latent = latent
+        frame.seconds = seconds

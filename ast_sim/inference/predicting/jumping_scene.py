@@ -76,8 +76,8 @@ class JumpingFrame:
         self.start = Start(self.name, scene.graph, state, scene.prescribed_position[self.number])
 
     @property
-    def unsettled(self) -> bool:
-        """Whether the Newton steps did not end."""
+    def not_converged(self) -> bool:
+        """Whether Newton steps were made and have not converged."""
         return self.failure is None and self.last_step is not None and self.last_step > STILL
 
     def refine(self, most: int, every_stress: bool, progress: Progress) -> None:
@@ -94,7 +94,7 @@ class JumpingFrame:
         try:
             solver = self.scene.solver(self.scene.question.scene)
             position = _array(self.positions[-1])
-            stuck = self.scene.settled(self.number - 1)
+            stuck = self.scene.refined_position(self.number - 1)
             patience = Patience(progress)
             for step in range(1, most + 1):
                 told = f"{self.name}: Newton step {step} of at most {most}"
@@ -134,7 +134,8 @@ class JumpingFrame:
         start = _array(self.positions[-1]) if self.failure is None else None
         try:
             position, self.along_load_path = self.scene.equilibria.solve(self.number, start)
-            self.failure, self.last_step = None, 0.0
+            self.failure = None
+            self.last_step = 0.0
             self.positions.append(torch.from_numpy(position.astype(np.float32)))
             if location != "none":
                 stress = self.scene.solver(self.scene.question.scene).von_mises(position, location)
@@ -157,7 +158,8 @@ class JumpingScene:
     frames: list[JumpingFrame] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        question, self.given = self.question, self.model.config.data.given_frames
+        question = self.question
+        self.given = self.model.config.data.given_frames
         self.prescribed_position = torch.tensor(question.prescribed_position)
         self.fields = question.given_fields(self.model.config.data, self.given)
         scheme = self.model.config.scheme
@@ -187,7 +189,7 @@ class JumpingScene:
         scene = self.question.scene
         return Equilibria.of(scene, law_of(self.model.config), self.question.prescribed_position, self.solver(scene))
 
-    def settled(self, number: int) -> np.ndarray | None:
+    def refined_position(self, number: int) -> np.ndarray | None:
         """The positions [N, 3] of a wanted frame that is given or has had its Newton steps, else None."""
         if number < self.given:
             return _array(self.prescribed_position[number]) if number in self.question.wanted() else None

@@ -152,7 +152,7 @@ def _from_coarse(coarse: SolidCase, solved: Trajectory, fine: SolidCase, frame: 
             raise GivenUp(f"it takes more than {MOST_SECONDS:g} s")
 
     frames.watch(watch)
-    frames.solver.newton.settle(position, stuck)
+    frames.solver.newton.equilibrate_near(position, stuck)
     position = frames.solver.newton.position
     frames.check({"position": position.astype(np.float32)})
     return position
