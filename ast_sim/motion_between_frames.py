@@ -144,7 +144,8 @@ class Course:
         if self.moved:
             corners = {corner for group in self.moved for corner in self._corners(group.motion)}
             return sorted(time for time in corners if first + ROUNDING < time < last - ROUNDING)
-        stops, stop = [], self.position[first, self.prescribed]
+        stops = []
+        stop = self.position[first, self.prescribed]
         for row in range(first + 1, last):
             here, ahead = self.position[row : row + 2, self.prescribed]
             from_stop, step = here - stop, ahead - here

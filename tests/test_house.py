@@ -136,9 +136,28 @@ def alike(values: list[ast.expr]) -> bool:
     return len(functions) == len(values) and of_one
 
 
+def written_out(value: ast.expr) -> str:
+    """The kind of a value that the line spells out: a number, a text, None, a flag, a list, ...; else empty."""
+    if isinstance(value, ast.UnaryOp | ast.BinOp):
+        parts = [value.operand] if isinstance(value, ast.UnaryOp) else [value.left, value.right]
+        return "number" if {written_out(part) for part in parts} == {"number"} else ""
+    if isinstance(value, ast.Constant):
+        return "number" if type(value.value) in (int, float) else type(value.value).__name__
+    kind = {ast.JoinedStr: "str", ast.ListComp: "List", ast.SetComp: "Set", ast.DictComp: "Dict"}.get(type(value))
+    return kind or (type(value).__name__ if isinstance(value, ast.List | ast.Set | ast.Dict | ast.Tuple) else "")
+
+
+def mixed(values: list[ast.expr]) -> bool:
+    """Whether values that one line assigns are unlike: what is written out stands beside its kind only, a call beside
+    calls of its function only, and a choice (`a if b else c`, `a or b`) beside nothing."""
+    if any(isinstance(value, ast.IfExp | ast.BoolOp) for value in values):
+        return True
+    calls = any(isinstance(value, ast.Call) for value in values)
+    return len({written_out(value) for value in values}) > 1 or (calls and not alike(values))
+
+
 def folded(source: str) -> list[str]:
-    """The assignments of several values to several names in which a call stands beside something unlike it, and the
-    assignments to a name that says nothing."""
+    """The assignments of unlike values to several names, and the assignments to a name that says nothing."""
     bad = []
     for node in ast.walk(ast.parse(source)):
         if (
@@ -146,8 +165,7 @@ def folded(source: str) -> list[str]:
             and isinstance(node.value, ast.Tuple)
             and isinstance(node.targets[0], ast.Tuple)
         ):
-            values = node.value.elts
-            if any(isinstance(value, ast.Call) for value in values) and not alike(values):
+            if mixed(node.value.elts):
                 bad.append(f"{node.lineno}: {ast.unparse(node)}")
         named = node.arg if isinstance(node, ast.arg) else node.id if isinstance(node, ast.Name) else ""
         if named in NO_NOUNS:
@@ -157,9 +175,30 @@ def folded(source: str) -> list[str]:
 
 def test_what_is_folded_is_seen():
     named = ("found = 1", "a = found", "def f(ways): 0")
-    for line in ("a, b = f(x), g(y)", "a, b = 1, g(y)", "a, b = np.zeros(3), np.ones(3)", *named):
+    choices = ("a, b = x if y else z, u", "a, b = f(x), y or z", "a, b = x or y, u or v")
+    beside = (
+        "0, n",
+        "None, 0.0",
+        "None, ''",
+        "[], {}",
+        "[], n",
+        "0, False",
+        "'none', ()",
+        "x, f'{y}'",
+        "[i for i in x], y",
+    )
+    calls = ("a, b = f(x), g(y)", "a, b = 1, g(y)", "a, b = np.zeros(3), np.ones(3)")
+    for line in (*calls, *choices, *(f"a, b = {values}" for values in beside), *named):
         assert len(folded(line)) == 1, line
-    for line in ("a, b = f(x), f(y)", "low, high = x.min(), x.max()", "a, b = b, a", "a, b = f(x)", "a = f(x), g(y)"):
+    alike_values = ("0, 0", "-1, 2**23 / 3", "[], [1]", "'a', 'b'", "None, None", "x + 1, y[0]", "(x, 0), (y, 1)")
+    same_function = (
+        "a, b = f(x), f(y)",
+        "low, high = x.min(), x.max()",
+        "a, b = b, a",
+        "a, b = f(x)",
+        "a = f(x), g(y)",
+    )
+    for line in (*same_function, *(f"a, b = {values}" for values in alike_values)):
         assert not folded(line), line
 
 

@@ -113,7 +113,9 @@ def harmonic_extension(scene: Scene, held: np.ndarray, free: np.ndarray) -> Call
     upper = low[inner], high[inner], integrals[inner]
     solve = _solver_of_band(diagonal, *upper, width) if count * width <= LARGEST_BAND else None
     solve = solve or _solver_of_sparse(diagonal, *upper)
-    pulled, pulling, strength = low[outer], high[outer] - count, integrals[outer]
+    pulled = low[outer]
+    pulling = high[outer] - count
+    strength = integrals[outer]
 
     def extend(displacement: np.ndarray) -> np.ndarray:
         pull = [np.bincount(pulled, strength * component[pulling], minlength=count) for component in displacement.T]

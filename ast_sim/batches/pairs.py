@@ -284,7 +284,8 @@ class PairSampler:
     def _step(self, pair: Pair, member: _Member, position: np.ndarray, after: np.ndarray) -> _Motion:
         before, now = position[0], position[-1]
         error, error_after = pair.error * member.noisy, pair.error_after * member.noisy
-        motion, previous = after - now + (error_after - error), None
+        motion = after - now + (error_after - error)
+        previous = None
         if self.scheme.has_inertia:
             if pair.error_before is not None:
                 before = before + pair.error_before * member.noisy

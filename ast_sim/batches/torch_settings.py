@@ -31,14 +31,16 @@ class _Shared:
         with self._lock:
             self._inside += 1
             if self._before is None and chosen.fp32_precision not in _EXACT:
-                self._before, chosen.fp32_precision = chosen.fp32_precision, "ieee"
+                self._before = chosen.fp32_precision
+                chosen.fp32_precision = "ieee"
         try:
             yield
         finally:
             with self._lock:
                 self._inside -= 1
                 if not self._inside and self._before is not None:
-                    chosen.fp32_precision, self._before = self._before, None
+                    chosen.fp32_precision = self._before
+                    self._before = None
 
 
 _products = _Shared()

@@ -41,7 +41,9 @@ class _Guess(Jump):
 
     def go_to(self, frame: int) -> None:
         """Jump to a frame from the one that was predicted."""
-        self.source, self.frame, self.then = self.frame, frame, None
+        self.source = self.frame
+        self.frame = frame
+        self.then = None
 
 
 class JumpPool(TrainingPool[_Guess]):
@@ -116,5 +118,7 @@ class JumpPool(TrainingPool[_Guess]):
             return False
         if scene.call == scene.last and scene.then is not None:
             scene.go_to(scene.then)
-            scene.call, scene.error, scene.source_error = 0, None, error
+            scene.call = 0
+            scene.error = None
+            scene.source_error = error
         return scene.call < scene.last

@@ -283,7 +283,8 @@ def _draw(
     order = np.random.default_rng(seed).permutation(len(names))
     rest = len(names) - calibration
     least = int(rest >= sum(share > 0 for share in shares.values()))
-    ends, total = [0], 0.0
+    ends = [0]
+    total = 0.0
     for split in ("valid", "test"):
         total += shares[split]
         end = max(int(rest * total + 0.5 - 1e-9), ends[-1] + least * (shares[split] > 0))

@@ -106,7 +106,8 @@ def parse_places(text: str, known: Iterable[str] = ()) -> list[Place]:
         rules += rule
         if ends:
             places.append(Place(text[start:place].strip().removesuffix(",").strip(), tuple(rules)))
-            rules, start = [], place
+            rules = []
+            start = place
     return places
 
 

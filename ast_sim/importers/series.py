@@ -181,11 +181,12 @@ def _read_frames(
     kept = KeptFrames()
     first = None
     stitching = None
-    used_fields = tuple(
-        filter(None, (names.obstacle, names.handle, names.node_type or "node_type", names.body or "body"))
-    )
+    named = (names.obstacle, names.handle, names.node_type or "node_type", names.body or "body")
+    used_fields = tuple(filter(None, named))
     constant = ConstantFields((*used_fields, *names.material_fields))
-    place, order, notes = "none", (), []
+    place = "none"
+    order = ()
+    notes = []
     given = frames(source) if job is None else job_frames(job, source, _pascals(names), tuple(further.wanted.values()))
     for frame in given:
         frame.require_consistent()
@@ -221,19 +222,24 @@ def _read_frames(
                 f"{frame.path}: holds 'von_mises', which the first frame lacks: write it into each frame, or into none"
             )
     assert first is not None and stitching is not None
-    files, times, _, said = frame_files(source)
-    notes += [*constant.notes(), *said, *told_of_components(names.displacement, first.point_fields)]
+    notes += [*constant.notes(), *told_of_components(names.displacement, first.point_fields)]
+    notes += _put_in_order_of_time(source, kept, further)
+    return mesh_of(first, stitching, corners), kept, notes, place
+
+
+def _put_in_order_of_time(source: Path, kept: KeptFrames, further: KeptFields) -> list[str]:
+    """The frames of files in order of their times, or with the times that a list of the files states; notes."""
+    files, times, _, notes = frame_files(source)
     if source.is_dir():
         by_time, said = ordered([file for (file,) in files], kept.times)
         kept.reorder(by_time)
         further.reorder(by_time)
-        notes += said
-    elif times is not None:
-        notes += doubts_of_times(source, times, kept.times)
-        kept.times = list(times)
-    else:
-        notes += kept.doubts()
-    return mesh_of(first, stitching, corners), kept, notes, place
+        return [*notes, *said]
+    if times is None:
+        return [*notes, *kept.doubts()]
+    notes = [*notes, *doubts_of_times(source, times, kept.times)]
+    kept.times = list(times)
+    return notes
 
 
 def frames(source: Path) -> Iterator[SourceMesh]:

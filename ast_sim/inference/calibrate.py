@@ -64,7 +64,8 @@ def calibrate(
         require_new_scenes(run, dataset, split)
         run.folder.require_best()  # which will keep the result
         require_known_weights(run)
-        before, run.calibration = run.calibration, None  # it has no say in which scenes count
+        before = run.calibration
+        run.calibration = None  # it has no say in which scenes count
         try:
             result, left_out = _measured(run, dataset, split, progress)
         except BaseException:

@@ -151,9 +151,8 @@ class Run:
             spec, parameters, nodes: instead of a scene and a motion, the specification of an assembly, values of its
                 parameters, and about how many nodes (None: by its sizes): spec="SPEC.toml", parameters={"travel": 4.2,
                 "young": {"bumper": 1.5e6}}. Other parameters are in the middle of their ranges.
-            frames: numbers of the frames that are wanted, such as [-1], or a slice, in the order of the answer; by
-                default all. A model that jumps computes no other frame. With friction ask for [-2, -1]: a body may be
-                in equilibrium in two places, and the frame before says in which.
+            frames: numbers of the wanted frames, such as [-1], or a slice; by default all. A model that jumps computes
+                no other frame. With friction take [-2, -1]: if a body has two equilibria, the frame before decides.
             effort: what follows the first call of a model that jumps; by default `self.effort`.
             error: instead, the relative error of the displacement at the deepest frame that 90 % of scenes keep, or by
                 quantity {"displacement": 0.05, "reaction": 0.1, "stress": 0.1} (`ast_sim.calibrate` first).
@@ -174,7 +173,8 @@ class Run:
             if not (scene is None and motion is None and stress is None):
                 raise ConfigError("a specification gives the scene and the motion: leave scene, motion and stress out")
             (built,) = ask(spec, [parameters or {}], self.scope, self.folder.specification, num_frames, nodes)
-            scene, motion, num_frames, facts, notes = built.scene, built.motion, None, built.facts, built.notes
+            scene, motion, facts, notes = built.scene, built.motion, built.facts, built.notes
+            num_frames = None
         elif parameters is not None or nodes is not None or scene is None:
             raise ConfigError("give a scene, or a specification with its parameters and nodes")
         question = new_question(self.settings.model, self.scope, scene, motion, num_frames, name, frames, stress, notes)

@@ -77,7 +77,9 @@ class QuasiStatic:
             NotConverged: there is no equilibrium after the allowed halvings and damped steps.
         """
         start = self.newton.position
-        done, part, smallest = 0.0, first, 0.5**self.newton.settings.max_halvings
+        done = 0.0
+        part = first
+        smallest = 0.5**self.newton.settings.max_halvings
         while done < 1:
             reached = min(1.0, done + part)
             between = start + reached * (target - start) if along is None else along(reached)

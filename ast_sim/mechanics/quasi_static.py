@@ -113,7 +113,8 @@ def solve_frame(
             raise GivenUp(f"more than {most_seconds:.3g} s of processor time")
 
     frames.watch(watch)
-    position, failure = None, ""
+    position = None
+    failure = ""
     try:
         for legs in [case.straight(frame)] if first else map(case.legs, range(1, frame + 1)):
             for leg in legs:
@@ -165,7 +166,8 @@ class SolidFrames(Frames[SolidRecord]):
 
     def next_frame(self) -> tuple[dict[str, np.ndarray], SolidRecord]:
         """See `Frames`."""
-        newton, self._work = self.solver.newton, 0.0
+        newton = self.solver.newton
+        self._work = 0.0
         cost = self.advance()
         if not self.records:
             self._reactions = self._held()

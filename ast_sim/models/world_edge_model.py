@@ -150,7 +150,8 @@ class DeepMLP(nn.Module):
         norm: Callable[[int], Norm] = nn.LayerNorm,
     ):
         super().__init__()
-        hidden, width = config.hidden, outputs or config.hidden
+        hidden = config.hidden
+        width = outputs or hidden
         self.first = layer(inputs, hidden)
         rest = MLP(hidden, hidden, width)
         self.rest = rest if config.hidden_layers == 2 else layer(hidden, width)

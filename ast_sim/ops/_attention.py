@@ -90,7 +90,8 @@ def _scores(q: Tensor, k: Tensor, scale: float) -> Tensor:
 
 def _join(like: Tensor, fill: float, parts: list[tuple[slice, Tensor]]) -> Tensor:
     """The rows of all scenes; the rows between these parts hold `fill`. Nothing is written to: vmap could not do it."""
-    rows, end = [], 0
+    rows = []
+    end = 0
     for where, x in (*parts, (slice(len(like), len(like)), like[:0])):
         rows += [like.new_full((where.start - end, *like.shape[1:]), fill), x]
         end = where.stop

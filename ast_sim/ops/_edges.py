@@ -201,7 +201,8 @@ def _breadth_first_reference(elements: Tensor, wanted: Tensor) -> Tensor:
             at_node[node].append(number)
 
     def search(start: int) -> list[int]:
-        reached, seen = [start], {start}
+        reached = [start]
+        seen = {start}
         for node in reached:
             for other in (other for number in at_node[node] for other in of_elements[number]):
                 if free[other] and other not in seen:

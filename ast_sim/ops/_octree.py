@@ -130,7 +130,9 @@ def _unit(positions: Tensor, center: Sequence[float], half_width: float) -> Tens
 
 
 def _check_domain(name: str, sizes: Sizes, given: Given) -> None:
-    positions, half_width, center = given["positions"], given["half_width"], [given[axis] for axis in "xyz"]
+    positions = given["positions"]
+    half_width = given["half_width"]
+    center = [given[axis] for axis in "xyz"]
     if not 0 < half_width < 1e300:
         raise ValueError(f"{name}: half_width must be positive and finite")
     if not all(abs(x) < 1e300 for x in center):

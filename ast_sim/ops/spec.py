@@ -113,9 +113,9 @@ class Argument:
         kind = 0 if self.shape is not None else 3 if "bits" in self.words else 2 if "number" in self.words else 1
         flags = (self.optional or "if" in self.words, self.output, "rows" in self.words, "filled" in self.words)
         other = places[self.words["with"]] if "with" in self.words else -1
-        shape, mine = self.shape or (), [word for word in self.words if word in CHECKS]
-        sizes = [Dimension.of(name) for name in self.names("size")] or shape
-        numbers = [kind, _TYPES[self.dtype], *map(int, flags), *self.bounds, other, len(shape), len(mine)]
+        mine = [word for word in self.words if word in CHECKS]
+        sizes = [Dimension.of(name) for name in self.names("size")] or self.shape or ()
+        numbers = [kind, _TYPES[self.dtype], *map(int, flags), *self.bounds, other, len(self.shape or ()), len(mine)]
         rows = [d.numbers() for d in sizes] + [[0] * 5] * (4 - len(sizes))
         for word in mine:
             bound, arrays = _inside(self.words[word])

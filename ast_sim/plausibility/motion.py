@@ -130,7 +130,9 @@ def _turn_over(scene: Scene, position: np.ndarray) -> list[Finding]:
     if scene.elements.shape[1] == 3:
         return []
     sign = np.sign(scene.rest_volumes)
-    count, first, frames = 0, None, []
+    count = 0
+    first = None
+    frames = []
     for number, frame in enumerate(position):
         wrong = (signed_volumes(frame, scene.elements) * sign <= 0) & scene.deforming_elements & (sign != 0)
         if wrong.any():

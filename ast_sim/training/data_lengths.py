@@ -59,7 +59,12 @@ def measure(dataset: Dataset) -> DataScales:
     count = dataset.count("train")
     if count == 0:
         raise TrainingError(f"{dataset.path} has no trajectories to train on: the split train is empty")
-    displacement, increment, lengths, nodes, constants, planar = [], [], [], [], [], True
+    displacement = []
+    increment = []
+    lengths = []
+    nodes = []
+    constants = []
+    planar = True
     center = np.array(dataset.info.domain_center)
     room = math.inf
     for name, trajectory in dataset.spread("train", MEASURED):

@@ -86,7 +86,8 @@ class Training:
         progress: ShowProgress = True,
     ) -> None:
         self.run, self.config, self.dataset, self.scales, self.signals = run, config, dataset, scales, signals
-        self.options, self.processes = config.train, processes or Processes()
+        self.options = config.train
+        self.processes = processes or Processes()
         self.schedule = Schedule.of(config.train)
         torch.manual_seed(self.options.seed)
         self.model = build_model(config.model)

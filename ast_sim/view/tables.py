@@ -95,7 +95,8 @@ def tiles(evaluation: Figures | None) -> list[Json]:
         model, reference = (evaluation.error(quantity, name) for name in (MODEL, trivial))
         if model is None:
             continue
-        error, detail = model.rmse_sequence, "full rollout, rmse_sequence"
+        error = model.rmse_sequence
+        detail = "full rollout, rmse_sequence"
         if error is None:
             detail = "no figure, because a rollout failed"
         elif reference is not None and reference.rmse_sequence:

@@ -98,7 +98,9 @@ def elements_of(keyword: Keyword, count: int) -> tuple[np.ndarray, list[list[str
 def nodes_in(keyword: Keyword) -> tuple[int, np.ndarray]:
     """How many elements a block has, and the numbers of all their nodes. How many nodes an element has is not known: it
     goes on after a comma at the end of a line."""
-    count, nodes, goes_on = 0, [], False
+    count = 0
+    nodes = []
+    goes_on = False
     for line in keyword.data:
         numbers = [whole(text, line) for text in tokens(line)]
         count += not goes_on

@@ -48,7 +48,8 @@ def plain_nastran(path: Path) -> bytes:
         DatasetError: it holds points in a system of their own, or elements that are not known, or lacks something; the
             text names the file and the line.
     """
-    points, cells = {}, []
+    points = {}
+    cells = []
     for place, (card, *fields) in _cards_of_nastran(path):
         name = card.rstrip("_")
         wrong = ""
@@ -110,7 +111,8 @@ def _cards_of_nastran(path: Path) -> Iterator[tuple[str, list[str]]]:
         else:
             if card:
                 yield first, card + 8 * [""]
-            first, card = place, [name.upper().rstrip("* "), *fields[:width]]
+            first = place
+            card = [name.upper().rstrip("* "), *fields[:width]]
         if card[0] == "ENDDATA":
             return
         mark = fields[width] if len(fields) > width else ""

@@ -63,19 +63,21 @@ def main() -> None:
 
 def _answer(request: dict[str, Any]) -> tuple[dict[str, Any], list[np.ndarray]]:
     window = _silent_window()
+    pieces: list[np.ndarray] = []
     try:
         head, pieces = _read(Path(request["path"]), request["step"])
     except MemoryError:
-        head, pieces = {"error": "needs more memory than a file of its size can"}, []
+        head = {"error": "needs more memory than a file of its size can"}
     except ImportError as error:
-        head, pieces = {"error": str(error), "missing": error.name}, []
+        head = {"error": str(error), "missing": error.name}
     except Refused as error:
-        head, pieces = {"error": str(error)}, []
+        head = {"error": str(error)}
     except Exception as error:  # also what VTK's Python layer raises, and arrays that VTK has left as they were
-        head, pieces = {"failed": str(error) or type(error).__name__}, []
+        head = {"failed": str(error) or type(error).__name__}
     told = [line for line in window.GetOutput().splitlines() if line.strip()]
     if told and "error" not in head:
-        head, pieces = {"error": _first_error(told)}, []
+        head = {"error": _first_error(told)}
+        pieces = []
     head = {"error": head["failed"]} if "failed" in head else head
     listed = [{name: (array.dtype.str, array.shape) for name, array in piece.items()} for piece in pieces]
     return {**head, "pieces": listed}, [array for piece in pieces for array in piece.values()]

@@ -182,7 +182,8 @@ def _of_pieces(path: Path) -> tuple[list[tuple[int, int]], int]:
     listed = declared_in_xml(path).sources
     if path.suffix.lower() in BLOCKS:
         listed = [entry.attrib["file"] for entry in ElementTree.parse(path).iter("DataSet") if entry.get("file")]
-    pieces, budget = [], _OWN_BYTES
+    pieces = []
+    budget = _OWN_BYTES
     for name in listed:
         file = path.parent / name
         if not file.is_file():

@@ -88,7 +88,8 @@ class KeptFields:
         Raises:
             DatasetError: a number is missing elsewhere.
         """
-        fields, notes = {}, []
+        fields = {}
+        notes = []
         for key, frames in self.frames.items():
             place = self.places[key]
             rows = [at_nodes(values) if place == "node" else values[element_rows] for values in frames]

@@ -133,9 +133,11 @@ def require_extent(path: Path, points: np.ndarray, elements: np.ndarray) -> None
     edges = corners[:, 1:] - corners[:, :1]
     longest = np.linalg.norm(corners[:, :, None] - corners[:, None], axis=-1).max(axis=(1, 2))
     if edges.shape[1] == 3:
-        size, kind = np.linalg.det(edges) / 6, "volume"
+        size = np.linalg.det(edges) / 6
+        kind = "volume"
     else:
-        size, kind = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) / 2, "area"
+        size = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) / 2
+        kind = "area"
     flat = np.abs(size) <= _FLAT * longest ** edges.shape[1]
     if flat.any():
         row = int(np.argmax(flat))

@@ -47,7 +47,8 @@ def weights_hash(model: torch.nn.Module) -> str:
 def forget_other_weights(run: Run, by_content: bool = False) -> None:
     """Take from a run what was measured of its answers, with a warning, if its weights have changed since."""
     if (run.calibration or run.measured) and not run.weights.are_of(run.model, by_content):
-        run.calibration, run.measured = None, []
+        run.calibration = None
+        run.measured = []
         run.folder.forget_answers()
         warn(f"the weights of {run.path} have changed since it was opened: no errors and no bands are known with these")
 

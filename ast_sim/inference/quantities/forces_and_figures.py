@@ -96,7 +96,8 @@ def write_figures(path: Path, answer: Answer) -> None:
 
 def figures_of(answer: Answer, origin: Sequence[float]) -> list[dict[str, float]]:
     """See `Answer.figures`."""
-    scene, rows = answer.scene, []
+    scene = answer.scene
+    rows = []
     shift = three_numbers(answer.name, "origin", origin)
     try:
         forces = answer.reaction()

@@ -46,7 +46,9 @@ def points_at_rest(rest: np.ndarray, elements: np.ndarray) -> tuple[np.ndarray, 
 
     A volume that is not positive belongs to an element that is turned over there; its gradients have no meaning.
     """
-    x, volumes, gradients = rest.T[:, elements.T], [], []  # [3, 10, E]
+    x = rest.T[:, elements.T]  # [3, 10, E]
+    volumes = []
+    gradients = []
     for slopes in SLOPES:
         jacobian = np.einsum("iae,ak->ike", x, slopes)
         cofactors = cofactor(jacobian)

@@ -81,7 +81,8 @@ class LinearSystem:
         rows = np.repeat(np.arange(self._count), np.diff(sparsity.starts))
         self._own, self._slot = rows * self._count + sparsity.columns, sparsity.slot
         self._factorization = factorization()
-        self.factorizations, self._has_factor = 0, False
+        self.factorizations = 0
+        self._has_factor = False
         self._set_pattern(self._own)
 
     @property
@@ -103,7 +104,8 @@ class LinearSystem:
         return inside, np.minimum(rows, columns) * self._count + np.maximum(rows, columns)
 
     def _set_pattern(self, pattern: np.ndarray) -> None:
-        self._pattern, self._is_new = pattern, True
+        self._pattern = pattern
+        self._is_new = True
         self._position = None if len(pattern) == len(self._own) else np.searchsorted(pattern, self._own)
         rows, self._columns = np.divmod(pattern, self._count)
         self._columns = self._columns.astype(np.int32)

@@ -41,7 +41,8 @@ class MessagePassing(nn.Module):
     ) -> Tensor:
         """senders [S, hidden], receivers [R, hidden], edge_features [M, edge_inputs] -> [R, hidden]."""
         *of_edge, of_sender, of_receiver = self.f_e.first.weight.split(self.hidden, dim=1)
-        constant, encoder = self.f_e.first.bias, None
+        constant = self.f_e.first.bias
+        encoder = None
         if self.edge_encoder is not None:
             first, last = self.edge_encoder.first, self.edge_encoder.second
             encoder = (first.weight, first.bias, of_edge[0] @ last.weight)

@@ -87,7 +87,8 @@ class AST(Simulator):
     def inputs_of(self, batch: Batch, use: Use = Normalizer.__call__) -> tuple[Tensor, Tensor, Tensor | None]:
         """See `Simulator`: of the nodes, the edges, and the elements, if they are nodes of the graph."""
         config, graph, now = self.config, batch.graph, batch.position
-        elements, senders = None, now
+        elements = None
+        senders = now
         if config.element_inputs:
             elements = use(self.element_inputs, element_features(config.element_inputs, batch))
             senders = graph.element_mean(now)

@@ -164,7 +164,8 @@ def _sized(spec: AssemblySpec, values: Values, nodes: int | None) -> tuple[float
     parts = placed(spec, values)
     if not nodes:
         return factor, parts
-    best, power = (factor, parts), USUAL_POWER
+    best = (factor, parts)
+    power = USUAL_POWER
     for _ in range(MESHES):
         count = sum(len(part.position) for part in parts)
         if abs(count - nodes) < abs(sum(len(part.position) for part in best[1]) - nodes):

@@ -141,7 +141,8 @@ class VariantSolver:
         start, first = self._solution(case, variant)
         more = variant.newton or variant.finished
         solved = self._best(lambda: self._continued(case, first, variant)) if more else first
-        position, error = None, np.inf
+        position = None
+        error = np.inf
         load_errors = np.inf, np.inf
         if solved.position is not None:
             own = variant.nodes == 1 or more
@@ -261,7 +262,8 @@ class VariantSolver:
         if solved.position is None:
             return solved
         began = process_time()
-        position, failure = None, ""
+        position = None
+        failure = ""
         setup = 0.0
         iterations = 0
         try:

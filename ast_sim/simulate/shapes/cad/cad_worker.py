@@ -105,7 +105,8 @@ def _load(gmsh, name: str, part: dict[str, Any]) -> PartModel:
     gmsh.model.add(name)
     if "stl" in part:
         return _load_stl(gmsh, name, part)
-    occ, scale = gmsh.model.occ, 1.0
+    occ = gmsh.model.occ
+    scale = 1.0
     if "step" in part:
         import_step(gmsh, part["step"])
         scale = _to_unit_diagonal(gmsh)
@@ -177,7 +178,8 @@ def _load_stl(gmsh, name: str, part: dict[str, Any]) -> PartModel:
 
 def _mesh_all(gmsh, models: list[PartModel], nodes: int) -> list[tuple[np.ndarray, np.ndarray]]:
     """Meshes of all parts with one element size, which is sought until they have about `nodes` nodes together."""
-    correction, nearest = 1.0, math.inf
+    correction = 1.0
+    nearest = math.inf
     best: list[tuple[np.ndarray, np.ndarray]] = []
     for _ in range(MESHES):
         size = _element_size(models, nodes / correction)

@@ -31,7 +31,8 @@ def _step(do: str, shape: str, **arguments: Any) -> dict[str, Any]:
 def _bore(size: np.ndarray, axis: int, radius: float, at: tuple[float, float]) -> dict[str, Any]:
     """A hole along `axis` through a box [0, size]. Its centre lies at the shares `at` of the two other sides."""
     start, direction = np.zeros(3), np.zeros(3)
-    start[axis], direction[axis] = -0.1, size[axis] + 0.2
+    start[axis] = -0.1
+    direction[axis] = size[axis] + 0.2
     others = [i for i in range(3) if i != axis]
     start[others] = size[others] * at
     return _step("cut", "cylinder", at=start, axis=direction, radius=radius)
