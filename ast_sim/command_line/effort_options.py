@@ -11,13 +11,15 @@ from ast_sim.support.errors import ConfigError
 from ast_sim.support.precisions import PRECISIONS
 
 PRECISION = (
-    "in which the model multiplies: bfloat16 keeps 8 binary digits of each factor and saves time in"
+    "number format of the factors when the model multiplies: bfloat16 keeps 8 binary digits of each and saves time in"
     " large scenes on some processors (default: float32)"
 )
 BEYOND = (
     "let the solver continue where Newton steps move a frame by more than this share of its displacement, such as 0.1"
 )
-EXACT = "let the solver continue from the answer of the run (with friction: from rest) until its stop test holds"
+EXACT = (
+    "after the model, run the solver from its answer (with friction: from rest) until the solver's own stop test holds"
+)
 
 
 def add_effort(parser: Parser, about: str | None = None) -> None:
@@ -29,8 +31,9 @@ def add_effort(parser: Parser, about: str | None = None) -> None:
     parser.add_argument("--exact", action="store_true", help=about or EXACT)
     parser.add_argument("--precision", choices=PRECISIONS, help=about or PRECISION)
     error = (
-        "instead: the cheapest effort that keeps this error of the displacement, such as 2%%, or of another quantity,"
-        " such as reaction=5%% or stress=10%%, in 90 %% of scenes (`calibrate` first); may be repeated"
+        "in place of the options of the effort: choose the cheapest effort that keeps this error in 90 %% of scenes,"
+        " of the displacement (2%%) or of another quantity (reaction=5%%, stress=10%%); `calibrate` the run first; may"
+        " be repeated"
     )
     place = "ast_sim.inference.promises.chosen_effort:parse_error"
     add_each(parser, {"--error E": error}, type=read_by(place), action="append", default=[])

@@ -20,7 +20,10 @@ def add_evaluate(evaluate: Parser) -> None:
     evaluate.add_argument("run_folder", type=path, metavar="RUN", help="run: a folder or a file (.ast)")
     evaluate.add_argument("data", type=path, metavar="DATA", help="dataset")
     evaluate.add_argument("--split", choices=SPLITS, default="test", help="split (default: test)")
-    about = f"scenes in which the solver solves the deepest frame, to compare (default: {SOLVER_SCENES}; 0: none)"
+    about = (
+        "number of scenes that the solver solves, too, for comparison, each to its deepest frame (default:"
+        f" {SOLVER_SCENES}; 0: none)"
+    )
     add_each(evaluate, {"--solver-scenes N": about}, type=at_least(0), default=SOLVER_SCENES)
     _add_made_from(evaluate)
     add_out(evaluate, "FILE.json", "also write all figures to this file", required=False)
@@ -42,8 +45,10 @@ def evaluate(args: argparse.Namespace) -> None:
 
 def add_calibrate(calibrate: Parser) -> None:
     """The arguments of `calibrate`."""
-    calibrate.add_argument("run_folder", type=path, metavar="RUN", help="run folder, which keeps the result")
-    calibrate.add_argument("data", type=path, metavar="DATA", help="dataset with 19 or more scenes new to RUN")
+    calibrate.add_argument("run_folder", type=path, metavar="RUN", help="run folder; the result is kept there")
+    calibrate.add_argument(
+        "data", type=path, metavar="DATA", help="dataset with 19 or more scenes that RUN has not seen"
+    )
     about = "split (default: calibration)"
     calibrate.add_argument("--split", choices=SPLITS, default="calibration", help=about)
 
@@ -58,13 +63,13 @@ def calibrate(args: argparse.Namespace) -> None:
 def add_trade(trade: Parser) -> None:
     """The arguments of `trade`."""
     trade.add_argument("run_folder", type=path, metavar="RUN", help="run: a folder or a file (.ast)")
-    trade.add_argument("data", type=path, metavar="DATA", help="dataset with scenes new to RUN (.h5)")
-    add_out(trade, "FILE.html", "page to write; all figures lie beside it (.json)")
+    trade.add_argument("data", type=path, metavar="DATA", help="dataset with scenes that RUN has not seen (.h5)")
+    add_out(trade, "FILE.html", "page to write; a file with all figures is written beside it (.json)")
     trade.add_argument("--split", choices=SPLITS, default="test", help="split (default: test)")
     about = "other runs that have learned from the same dataset as RUN"
     add_each(trade, {"--beside OTHER_RUN": about}, type=path, nargs="+", action="extend", default=[])
-    add_each(trade, {"--scenes N": "scenes, at most (default: 20)"}, type=at_least(1), default=20)
-    about = "seconds that another program takes for such a scene; our solver is not run then"
+    add_each(trade, {"--scenes N": "largest number of scenes (default: 20)"}, type=at_least(1), default=20)
+    about = "seconds that another program takes for a scene; then our solver is not run"
     add_each(trade, {"--solver-seconds S": about}, type=float)
     _add_made_from(trade)
 

@@ -12,21 +12,24 @@ def add_plan(plan: Parser) -> None:
     """The arguments of `plan`."""
     about = "dataset with training and validation scenes (.h5), or the specification of an assembly (.toml)"
     plan.add_argument("data", type=path, metavar="DATA_OR_SPEC", help=about)
-    add_each(plan, {"--minutes M": "of the training that is planned"}, type=float, required=True)
-    about = "folder for the trials; a second call goes on with what is there"
+    add_each(plan, {"--minutes M": "length of the planned training in minutes"}, type=float, required=True)
+    about = "folder for the trials; a second call continues with the trials that are there"
     add_each(plan, {"--out FOLDER": about}, type=path, required=True)
     train = plan.add_argument_group("if DATA_OR_SPEC is a dataset")
     add_each(train, {"--model M": "as for train", "--preset P": "as for train"})
     add_each(train, {"--state NAME": "as for train", "--set k=v": "as for train"}, action="append", default=[])
     spec = plan.add_argument_group("if DATA_OR_SPEC is the specification of an assembly")
-    sizes = {"--nodes N": "approximate number of nodes (default: by the sizes)", "--frames N": "frames of a scene"}
+    sizes = {
+        "--nodes N": "approximate number of nodes (default: the sizes in the specification decide)",
+        "--frames N": "number of frames of a scene",
+    }
     add_each(spec, sizes, type=at_least(1))
     spec.add_argument("--solver", choices=("own", "calculix"), help="as for generate")
     plan.set_defaults(of_data=(train,), of_spec=(spec,))
 
 
 def plan(args: argparse.Namespace) -> None:
-    """Say by short trials what a training will give, and when a model pays."""
+    """Forecast by short trials the error that a training will reach, or when a model of a specification pays."""
     from ast_sim import keep_memory
     from ast_sim.planning.plan import planned
     from ast_sim.planning.worth import worth

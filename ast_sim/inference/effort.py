@@ -49,8 +49,8 @@ class Effort:
         solved_beyond: only frames that the Newton steps move away from the model's answer by more than this share of
             their displacement, or in which they fail, are solved: such an answer was too far from equilibrium to be
             trusted. 0: all frames.
-        precision: in which the model multiplies: "bfloat16" rounds both factors of a product to 8 binary digits, which
-            saves time in large scenes on some processors (`ast_sim.ops.products_in`).
+        precision: the number format of factors when the model multiplies: "bfloat16" rounds them to 8 binary digits,
+            which saves time in large scenes on some processors (`ast_sim.ops.products_in`).
 
     Raises:
         ConfigError: a number is not whole or negative, there is no such precision, or no frame is solved but
@@ -58,11 +58,12 @@ class Effort:
     """
 
     corrections: int = _dial(
-        "calls that correct the first one, in a run that predicts a frame directly (default: as its validation decided)"
+        "number of calls that correct the first one, in a run that predicts a frame directly (default: as validation"
+        " found best)"
     )
     newton_steps: int = _dial(
-        "Newton steps of the solver after these calls, at most; they end when one is small (default: as validation"
-        " decided; 0 with --corrections)"
+        "largest number of Newton steps of the solver after these calls; they end when one is small (default: as"
+        " validation found best; 0 with --corrections)"
     )
     solved: bool = False
     solved_beyond: float = 0.0

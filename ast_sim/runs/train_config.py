@@ -34,11 +34,15 @@ class TrainConfig:
         " at least 3000 nodes a step, and 1 if the training takes about a minute; with torchrun, as many as it starts",
     )
     optimizer: OptimizerName = setting(
-        "adamw", "adamw; or muon for the matrices inside the model: it needs fewer steps, but each step is slower"
+        "adamw",
+        "adamw for all weights; or muon for the matrices inside the model, and adamw for the rest: fewer steps are"
+        " needed, but each is slower",
     )
     peak_rate: float | None = setting(None, "highest learning rate; unset: 1e-4 sqrt(scenes per step / 2)")
     warmup: int | None = setting(
-        None, "steps in which the learning rate grows from 1e-4 of its peak; unset: 5 % of all steps, at most 2000"
+        None,
+        "steps at the beginning in which the learning rate grows from 1e-4 of its peak to the peak; unset: 5 % of"
+        " all steps, at most 2000",
     )
     decay: int | None = setting(
         None,
@@ -46,8 +50,8 @@ class TrainConfig:
     )
     precision: Precision = setting(
         "float32",
-        "in which the model multiplies; bfloat16 keeps 8 binary digits of each factor of a product, on processors that"
-        " are faster so; sums and the gradients of weights stay in float32",
+        "number format of the factors when the model multiplies; bfloat16 keeps 8 binary digits of each, on processors"
+        " that are faster with it; sums and the gradients of weights stay in float32",
     )
     clip: float = setting(1.0, "largest norm of the gradient; a longer gradient is scaled down to it")
     noise: float | None = setting(
@@ -62,10 +66,10 @@ class TrainConfig:
         " model is ast or transolver, else 0; always 0 with model.jumps and without noise",
     )
     corrections: int = setting(
-        0, "with model.jumps: further calls that correct the first one in training; without jumps 0"
+        0, "with model.jumps: number of calls that correct the first one in training; without jumps 0"
     )
     noise_gamma: float | None = setting(
-        None, "with noise: share of it that the target takes back; unset: 1, in dynamic scenes 0.1"
+        None, "share of the noise that the target corrects; unset: 1, in dynamic scenes 0.1"
     )
     mirror: tuple[Literal["x", "y", "z"], ...] = setting(
         (), "axes along which scenes are mirrored at random; name only axes that gravity, fibres or chirality allow"
@@ -78,20 +82,20 @@ class TrainConfig:
     stress_weight: float = setting(0.01, "weight of the stress in the loss; the motion has the weight 1")
     strain_weight: float | None = setting(
         0.0,
-        "weight of the error's differences along the edges of deforming elements in the loss, from which the errors of"
-        " forces and stresses follow; unset: 1 with model.jumps, else 0",
+        "weight of the error of strains in the loss, measured along the edges of deforming elements; it lowers the"
+        " errors of forces and stresses; unset: 1 with model.jumps, else 0",
     )
     statistics_pairs: int = setting(400, "pairs of frames from which the scales of inputs and outputs are measured")
     seed: int = setting(0, "seed of the initial weights, the order of the pairs, the noise and dropout")
     validate_every: int | None = setting(
         None, "steps from one validation (rollouts of validation scenes) to the next; unset: a tenth of all steps"
     )
-    validate_scenes: int = setting(8, "number of validation scenes that are predicted; these are the first ones")
+    validate_scenes: int = setting(8, "number of validation scenes that are predicted: the first ones of the split")
     checkpoint_every: int | None = setting(
         None, "steps from one checkpoint to the next; unset: a checkpoint at each validation"
     )
-    keep: int = setting(3, "number of checkpoints that are kept: the newest ones; the best one is kept as well")
-    log_every: int = setting(100, "steps whose mean is one line of metrics.jsonl")
+    keep: int = setting(3, "number of newest checkpoints that are kept; the best one is kept as well")
+    log_every: int = setting(100, "steps from one line of metrics.jsonl to the next; a line holds their means")
 
 
 def _model_class(table: Mapping[str, Any]) -> type[ModelConfig]:
