@@ -157,7 +157,7 @@ class DeepestFrames:
         not_converged: the number of scenes whose Newton steps have not converged.
         solver: beside the solver at its own stop test; None: it was not run.
         cheapest: beside its fastest variant that is at least as accurate; None: likewise.
-        no_solver: why the solver was not run; None: it was, or nobody asked.
+        no_solver: why the solver was not run; None: it was, or `solver_scenes` is 0.
     """
 
     scenes: tuple[DeepestFrame, ...]

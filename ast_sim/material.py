@@ -10,7 +10,7 @@ from numbers import Real
 import numpy as np
 
 from ast_sim.support.argument_checks import in_short, require_type, several
-from ast_sim.support.errors import ConfigError
+from ast_sim.support.errors import ConfigError, counted
 
 YOUNG, POISSON, FRICTION = "young", "poisson", "friction"
 ELASTIC = (YOUNG, POISSON)  # Young's modulus in pascal, Poisson's ratio
@@ -76,7 +76,8 @@ class Material:
         width = 0 if values is None else values.shape[1]
         if width != len(self.columns):
             raise ConfigError(
-                f"the material has {width} columns, but {len(self.columns)} names: {', '.join(self.columns)}"
+                f"the material has {counted(width, 'column')}, but {counted(len(self.columns), 'name')}:"
+                f" {', '.join(self.columns)}"
             )
         if values is not None and name in self.columns:
             return values[:, self.columns.index(name)].astype(np.float64)

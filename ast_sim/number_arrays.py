@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ast_sim.support.argument_checks import in_short, several
-from ast_sim.support.errors import ConfigError, DatasetError
+from ast_sim.support.errors import ConfigError, DatasetError, counted
 from ast_sim.support.toml_settings import required_whole
 
 # Elements from which the search for connected parts makes pairs of nodes at a time. This limits its memory.
@@ -111,7 +111,7 @@ def nodes_of_body(body: np.ndarray, number: int) -> np.ndarray:
     nodes = body == number
     if not nodes.any():
         numbers, counts = np.unique(body, return_counts=True)
-        known = [f"{one} ({count} nodes)" for one, count in zip(numbers[:10], counts[:10], strict=True)]
+        known = [f"{one} ({counted(count, 'node')})" for one, count in zip(numbers[:10], counts[:10], strict=True)]
         more = ["..."] if len(numbers) > 10 else []
         raise ConfigError(f"there is no body {number}; there are: {', '.join(known + more)}")
     return nodes
@@ -165,7 +165,7 @@ def require_numbering(name: str, count: int, frames: Sequence[int] | None, times
         if values is None:
             continue
         if len(values) != count:
-            raise DatasetError(f"{name}: {what} has {len(values)} numbers for {count} frames")
+            raise DatasetError(f"{name}: {what} holds {counted(len(values), 'number')} for {counted(count, 'frame')}")
         are_numbers = np.asarray(values).dtype.kind in kinds
         if not are_numbers or not np.isfinite(values).all() or (np.diff(values) <= 0).any():
             raise DatasetError(f"{name}: {what} must be {kind} and ascend: {list(values)}")

@@ -56,10 +56,10 @@ class RigidMotion:
 
     def __post_init__(self) -> None:
         for name, wanted, shape in (
-            ("translation", "three numbers or a list of triples", (3,)),
-            ("rotation", "one number", ()),
-            ("axis", "three numbers, not all zero", (3,)),
-            ("point", "three numbers", (3,)),
+            ("translation", "three numbers or a list of triples, all finite and", (3,)),
+            ("rotation", "one finite number of", ()),
+            ("axis", "three numbers, not all zero, all finite and", (3,)),
+            ("point", "three numbers, all finite and", (3,)),
         ):
             value = getattr(self, name)
             numbers = _numbers(value)
@@ -67,9 +67,8 @@ class RigidMotion:
             fits = numbers.shape == shape or is_path
             fits = fits and (name != "axis" or np.any(np.abs(numbers) > 1 / LARGEST))
             if not fits or not (np.abs(numbers) <= LARGEST).all():
-                raise ConfigError(
-                    f"{name} of a motion must be {wanted}, all finite and at most {LARGEST:g}, not {value}"
-                )
+                shown = repr(value) if isinstance(value, str) else value
+                raise ConfigError(f"{name} of a motion must be {wanted} at most {LARGEST:g}, not {shown}")
 
     def at(self, s: float, points: np.ndarray) -> np.ndarray:
         """[n, 3] float64: the positions of the undeformed `points` [n, 3] at `s` in [0, 1]."""

@@ -6,6 +6,7 @@ import numpy as np
 
 from ast_sim.element_topology import surface_triangles, unit_normals
 from ast_sim.mesh_arrays import NodeType
+from ast_sim.support.errors import counted
 
 MOST_TRIANGLES = 6000  # a drawing of more would be megabytes
 WIDTH, HEIGHT = 360, 260
@@ -28,7 +29,7 @@ def scene_facts(
         "nodes": f"{len(position):,} ({types})",
         kind: f"{len(elements):,}",
         "extent": extent,
-        "material": "none" if material is None else f"{material.shape[1]} columns",
+        "material": "none" if material is None else f"{counted(material.shape[1], 'column')}",
     }
 
 

@@ -16,6 +16,7 @@ from typing import Any, Self
 import numpy as np
 
 from ast_sim.number_arrays import measured_time, percent
+from ast_sim.support.errors import counted
 
 TOLERANCES = (0.1, 0.05, 0.025, 0.01, 0.005, 0.002)
 WITHIN = 0.9
@@ -103,7 +104,7 @@ class TradeRow:
         sides = (self.run, self.solver, *self.others.values())
         settings = ["none" if one is None else f"{one.time}: {one.name}" for one in sides]
         ratio = "–" if self.ratio is None else f"{self.ratio:.2f} ({self.low:.2f} to {self.high:.2f})"
-        pays = "–" if self.pays_after is None else f"{self.pays_after:,} questions"
+        pays = "–" if self.pays_after is None else counted(self.pays_after, "question")
         return [f"{100 * self.tolerance:g} %", *settings, ratio, self.verdict, pays]
 
 
@@ -195,7 +196,7 @@ class TradeFigures:
         """One sentence on the error of the mesh itself; empty: it is not known."""
         if self.mesh_error is None:
             return ""
-        scenes = f"{len(self.mesh_errors)} scene{'s' * (len(self.mesh_errors) > 1)}"
+        scenes = counted(len(self.mesh_errors), "scene")
         return (
             f"The mesh alone makes the {self.quantity} {percent(self.mesh_error)} wrong (median of {scenes}, against"
             " 8 times the nodes): an answer with a smaller error is no nearer to the truth"
@@ -203,7 +204,7 @@ class TradeFigures:
 
     def lines(self) -> list[str]:
         """The table as text."""
-        counts = f"{len(self.scenes)} scenes, deepest frame, one thread"
+        counts = f"{counted(len(self.scenes), 'scene')}, deepest frame, one thread"
         told = [f"{counts}; error of the {self.quantity} kept in {100 * WITHIN:g} % of them"]
         for row in self.rows():
             sides = (("the run", row.run), ("the solver", row.solver), *row.others.items())
@@ -211,7 +212,7 @@ class TradeFigures:
             if row.ratio is not None:
                 parts.append(f"ratio {row.ratio:.2f} ({row.low:.2f} to {row.high:.2f}): {row.verdict}")
             if row.pays_after is not None:
-                parts.append(f"pays after {row.pays_after:,} questions")
+                parts.append(f"pays after {counted(row.pays_after, 'question')}")
             told.append(f"{100 * row.tolerance:g} %: {'; '.join(parts)}")
         return told + self.notes
 

@@ -164,9 +164,9 @@ def folded(source: str) -> list[str]:
             isinstance(node, ast.Assign)
             and isinstance(node.value, ast.Tuple)
             and isinstance(node.targets[0], ast.Tuple)
+            and mixed(node.value.elts)
         ):
-            if mixed(node.value.elts):
-                bad.append(f"{node.lineno}: {ast.unparse(node)}")
+            bad.append(f"{node.lineno}: {ast.unparse(node)}")
         named = node.arg if isinstance(node, ast.arg) else node.id if isinstance(node, ast.Name) else ""
         if named in NO_NOUNS:
             bad.append(f"{node.lineno}: {named}")

@@ -143,14 +143,15 @@ def test_a_move_that_cannot_be_read(text):
         (lambda: RigidMotion((0, 0, np.nan)), "translation of a motion must be .*all finite"),
         (
             lambda: RigidMotion(rotation=np.inf),
-            r"rotation of a motion must be one number, all finite and at most 1e\+15, not inf",
+            r"rotation of a motion must be one finite number of at most 1e\+15, not inf",
         ),
+        (lambda: RigidMotion(rotation="30"), r"rotation of a motion must be one finite number of .*, not '30'$"),
         (lambda: RigidMotion(rotation=9, axis=(0, 0, 0)), "axis of a motion must be three numbers, not all zero"),
         (lambda: RigidMotion(rotation=9, point=(0, 0)), "point of a motion must be three numbers"),
         (lambda: parse_move("1=0,0,nan"), "translation of a motion must be .*all finite"),
         (
             lambda: Motion.of_bodies(SCENE, {7: (0, 0, 1)}, 3),
-            r"there is no body 7; there are: 0 \(4 nodes\), 1 \(1 nodes\)",
+            r"there is no body 7; there are: 0 \(4 nodes\), 1 \(1 node\)",
         ),
         (lambda: Motion.of_bodies(SCENE, {1: (0, 0, 1)}, 1), "at least 2 frames, not 1"),
         (lambda: frames_for(SCENE, {7: (0, 0, 1)}, 1.0), "there is no body 7"),

@@ -5,6 +5,7 @@ import math
 import pytest
 
 from ast_sim.number_arrays import measured_time, percent
+from ast_sim.support.errors import counted
 
 
 @pytest.mark.parametrize(
@@ -39,3 +40,8 @@ def test_a_share_in_percent_has_no_exponent(share, digits, text):
 )
 def test_a_time_has_no_exponent(seconds, text):
     assert measured_time(seconds) == text
+
+
+def test_one_thing_is_counted_in_the_singular():
+    assert [counted(n, "node") for n in (0, 1, 2, 1234)] == ["0 nodes", "1 node", "2 nodes", "1,234 nodes"]
+    assert [counted(n, "element is", "elements are") for n in (1, 2)] == ["1 element is", "2 elements are"]

@@ -98,7 +98,7 @@ def test_truth_values_are_no_numbers(run, scene):
             f"scene: {name} must be whole numbers, not bool",
         )
     refused(lambda: run.predict(scene, {1: (False, False, True)}), "translation of a motion must be three numbers or")
-    refused(lambda: ast_sim.RigidMotion(rotation=True), "rotation of a motion must be one number")
+    refused(lambda: ast_sim.RigidMotion(rotation=True), "rotation of a motion must be one finite number")
     moved = torch.tensor((0, 0, -0.01), requires_grad=True)
     refused(lambda: ast_sim.RigidMotion(moved), "translation of a motion must be three numbers or")
 
@@ -153,7 +153,7 @@ def test_arguments_of_several_predictions(run, scene):
         refused(lambda scenes=scenes: run.predict_scenes(scenes), f"scenes is {in_short(scenes)}; {pairs}")
     for scenes in ([scene], [(scene,)]):
         refused(lambda scenes=scenes: run.predict_scenes(scenes), "it must be a pair of a scene and a motion")
-    refused(lambda: run.predict_scenes([(scene, PRESS)], names=["a", "b"]), "there are 2 names for 1 scenes")
+    refused(lambda: run.predict_scenes([(scene, PRESS)], names=["a", "b"]), "there are 2 names for 1 scene")
     refused(lambda: run.predict_scenes([(scene, PRESS)], names="a"), "names is 'a'; it must be a list")
     for motions in (None, PRESS):
         text = f"motions is {in_short(motions)}; it must be a list of motions"

@@ -14,7 +14,7 @@ class Ahead:
     """The batches of a sampler or a pool, in ascending order. A thread begins each while the batch before it is used.
 
     So the making of a batch must not depend on the use of the batch before it. The thread ends with this context
-    manager. An error in making a batch is raised when that batch is asked for.
+    manager. An error in making a batch is raised when that batch is taken.
 
     Args:
         prepare: what the thread does to each batch: what a model needs of it that does not depend on its parameters.

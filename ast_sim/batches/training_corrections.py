@@ -114,7 +114,7 @@ class JumpPool(TrainingPool[_Guess]):
 
     def _goes_on(self, scene: _Guess, error: np.ndarray) -> bool:
         scene.call, scene.error = scene.call + 1, error
-        if self._lost(error):
+        if self._is_too_large(error):
             return False
         if scene.call == scene.last and scene.then is not None:
             scene.go_to(scene.then)

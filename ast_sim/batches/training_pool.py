@@ -71,11 +71,11 @@ class TrainingPool(ABC, Generic[S]):
         return self._sampler.assemble([self._frames(place, self._going[place]) for place in self._places(number)])
 
     def errors(self, number: int, target: Target) -> list[tuple[int, float]]:
-        """What `weights` needs to know of a batch; asked for only if the pool `weighs`."""
+        """What `weights` needs to know of a batch; computed only if the pool `weighs`."""
         raise NotImplementedError
 
     def weights(self, number: int, errors: list[tuple[int, float]]) -> Tensor:
-        """[B]: how much the squared error of each scene of a batch counts; asked for only if the pool `weighs`.
+        """[B]: how much the squared error of each scene of a batch counts; computed only if the pool `weighs`.
 
         Args:
             errors: of all parts of the batch, in their order.
@@ -124,6 +124,6 @@ class TrainingPool(ABC, Generic[S]):
         index = int(sampler.random(order, epoch).permutation(sampler.trajectories)[number])
         return self._start(index, begun == 1, sampler.random(draws, place, begun))
 
-    def _lost(self, error: np.ndarray) -> bool:
+    def _is_too_large(self, error: np.ndarray) -> bool:
         """Whether an error is too large to learn from."""
         return bool(np.sqrt(np.mean(np.square(error, dtype=np.float64))) > self._largest)

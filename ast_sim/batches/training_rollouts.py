@@ -85,5 +85,5 @@ class RolloutPool(TrainingPool[_Rolling]):
         scene.t += 1
         error = error + scene.pair.error_after  # the residual counts from the target, which has an error of its own
         before = scene.pair.error if self._sampler.scheme.has_inertia else None
-        scene.error, scene.error_before = (None, None) if self._lost(error) else (error, before)
+        scene.error, scene.error_before = (None, None) if self._is_too_large(error) else (error, before)
         return scene.t < self._sampler.last_frame(scene.index)

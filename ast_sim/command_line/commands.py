@@ -16,7 +16,7 @@ from ast_sim.command_line.effort_options import effort_of, error_of
 from ast_sim.runs import CONFIG, SCOPE
 from ast_sim.support.argument_types import by_name
 from ast_sim.support.disk import output_file
-from ast_sim.support.errors import ConfigError, DatasetError, RolloutError, printable
+from ast_sim.support.errors import ConfigError, DatasetError, RolloutError, counted, printable
 
 SPLITS = ("train", "valid", "test", "calibration")
 
@@ -71,7 +71,10 @@ def _look(args: argparse.Namespace) -> None:
     scenes = sum(checked_counts(args.count or 100, args.valid, args.test, args.calibration).values())
     workers = checked_workers(args.workers, None)
     cost = duration(each * scenes / workers)
-    print(f"--count {args.count or 100}: {scenes} scenes, about {cost} with {workers} process{'es' * (workers > 1)}")
+    print(
+        f"--count {args.count or 100}: {counted(scenes, 'scene')}, about {cost} with"
+        f" {counted(workers, 'process', 'processes')}"
+    )
     print(f"picture: {picture}")
 
 
@@ -157,7 +160,9 @@ def info(args: argparse.Namespace) -> None:
         facts = describe_dataset(args.path)
     print(json.dumps(facts, indent=1) if args.json else text(_with_answers_in_words(facts)))
     if args.strict and facts.get("looks_wrong"):
-        raise DatasetError(f"{args.path}: {len(facts['looks_wrong'])} things look wrong in it")
+        raise DatasetError(
+            f"{args.path}: {counted(len(facts['looks_wrong']), 'thing looks', 'things look')} wrong in it"
+        )
 
 
 def _with_answers_in_words(facts: dict[str, Any]) -> dict[str, Any]:
@@ -276,9 +281,12 @@ def sweep(args: argparse.Namespace) -> None:
         error=error_of(args),
     )
     swept.save(args.out)
-    print(f"{args.out}: {len(swept.rows)} rows, {measured_time(swept.seconds / len(swept.rows))} each")
+    print(f"{args.out}: {counted(len(swept.rows), 'row')}, {measured_time(swept.seconds / len(swept.rows))} each")
     if swept.not_converged:
-        print(f"not converged: {swept.not_converged} of {len(swept.rows)} rows, where last_newton_step is too large")
+        print(
+            f"not converged: {swept.not_converged} of {counted(len(swept.rows), 'row')}, where last_newton_step is too"
+            " large"
+        )
     if swept.varied:
         swept.picture(picture, args.quantity)
         print(f"picture: {picture}")

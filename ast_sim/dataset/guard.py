@@ -27,7 +27,7 @@ from ast_sim.dataset.layout import (
     trajectory_hash,
 )
 from ast_sim.scene import AttributeValue
-from ast_sim.support.errors import AstSimError, DatasetError
+from ast_sim.support.errors import AstSimError, DatasetError, counted
 from ast_sim.support.read_only_arrays import kept
 
 HASHED_AT_ONCE = 1 << 24
@@ -176,7 +176,7 @@ class GuardedFile:
         array = self.child(group, key, h5py.Dataset)
         with self.reading(_path(group, key)) as name:
             if array.dtype != dtype or array.ndim != rank:
-                stored = f"{array.dtype} with {array.ndim} axes"
+                stored = f"{array.dtype} with {counted(array.ndim, 'axis', 'axes')}"
                 raise DatasetError(f"{name} is {stored}; must be {np.dtype(dtype)} with {rank}")
             if array.is_virtual or array.external:
                 raise DatasetError(f"{name} keeps its numbers in another file, which is not followed")
@@ -188,8 +188,8 @@ class GuardedFile:
                 size = math.prod(declared) * array.dtype.itemsize
                 if size > self.size:
                     raise DatasetError(
-                        f"{name} declares the shape {list(declared)}, {size} bytes, but the file has {self.size}: it is"
-                        " truncated or damaged"
+                        f"{name} declares the shape {list(declared)}, {size} bytes, but the file has"
+                        f" {self.size}: it is truncated or damaged"
                     )
             if shape not in (None, array.shape):
                 raise DatasetError(f"{name} has the shape {list(array.shape)}, must be {list(shape)}")

@@ -15,7 +15,7 @@ from ast_sim.material import FRICTION, POISSON, YOUNG, Material
 from ast_sim.number_arrays import real_numbers, three_numbers
 from ast_sim.scene import AttributeValue, Scene
 from ast_sim.support.argument_checks import in_short, require_type
-from ast_sim.support.errors import DatasetError
+from ast_sim.support.errors import DatasetError, counted
 
 FORMAT = "ast_sim"
 VERSION = 3
@@ -137,8 +137,8 @@ class DatasetInfo:
         names = tuple(map(str, named)) if isinstance(named, list | tuple) else (str(named),)
         if len(names) != width or len(set(names)) != width:
             raise DatasetError(
-                f"the material has {width} columns, but generator['material'] names {', '.join(names) or 'none'}: give"
-                " each column one name"
+                f"the material has {counted(width, 'column')}, but generator['material'] names"
+                f" {', '.join(names) or 'none'}: give each column one name"
             )
         return Material(names)
 
@@ -164,8 +164,8 @@ def require_kind(name: str, scene: Scene, known: tuple[int, int] | None) -> tupl
     kind = scene.elements.shape[1], 0 if scene.material is None else scene.material.shape[1]
     if known not in (None, kind):
         raise DatasetError(
-            f"{name}: has {kind[0]} nodes per element and {kind[1]} material columns; other samples have {known[0]}"
-            f" and {known[1]}"
+            f"{name}: has {counted(kind[0], 'node')} per element and {counted(kind[1], 'material column')}; other"
+            f" samples have {known[0]} and {known[1]}"
         )
     return kind
 

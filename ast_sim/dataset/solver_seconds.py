@@ -19,7 +19,7 @@ from ast_sim.dataset.layout import SPLITS
 from ast_sim.dataset.reader import Dataset
 from ast_sim.scene import AttributeValue
 from ast_sim.support.disk import write_text
-from ast_sim.support.errors import warn
+from ast_sim.support.errors import counted, warn
 
 SUFFIX = "_seconds"
 
@@ -99,7 +99,7 @@ def _misfit(dataset: Dataset, samples: dict[str, list[float]]) -> str:
     }
     for name, seconds in samples.items():
         if len(seconds) != frames.get(name):
-            return f"has {len(seconds)} times of {name}, which has {frames.get(name, 'no')} frames"
+            return f"has {counted(len(seconds), 'time')} of {name}, which has {frames.get(name, 'no')} frames"
         if not all(0 <= second < math.inf for second in seconds):
             return f"has times of {name} that are below 0 or not finite"
         if len(seconds) > 1 and sum(seconds) == 0:

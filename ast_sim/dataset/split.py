@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, overload
 
 from ast_sim.scene import Trajectory
+from ast_sim.support.errors import counted
 from ast_sim.support.notebook_table import html_table, one_line
 
 if TYPE_CHECKING:
@@ -41,7 +42,7 @@ class Split(Sequence[Trajectory]):
         try:
             number = self._indices[index]
         except IndexError as error:
-            raise IndexError(f"{self.name} has {len(self)} scenes: there is no {index}") from error
+            raise IndexError(f"{self.name} has {counted(len(self), 'scene')}: there is no {index}") from error
         cauchy_stress = self._dataset.cauchy_stress(self.name, number)
         fields = self._dataset.fields(self.name, number)
         return replace(self._dataset.load(self.name, number), cauchy_stress=cauchy_stress, fields=fields)

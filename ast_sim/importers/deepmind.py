@@ -20,7 +20,7 @@ from ast_sim.importers.deepmind_meta import LENGTH, Meta, read_meta
 from ast_sim.importers.tfrecord import count_records, find_values, read_records
 from ast_sim.number_arrays import connected_parts, require_array
 from ast_sim.scene import Scene, Trajectory
-from ast_sim.support.errors import DatasetError
+from ast_sim.support.errors import DatasetError, counted
 from ast_sim.support.progress import Progress, ShowProgress
 
 SUFFIX = ".tfrecord"
@@ -137,8 +137,8 @@ class _Record:
             return np.frombuffer(values, dtype).reshape(shape)
         except (ValueError, OverflowError) as error:
             raise DatasetError(
-                f"{self.where}: the feature {name} has {len(values)} bytes; {META} says {dtype.name} {list(shape)}, a"
-                f" multiple of {abs(math.prod(shape)) * dtype.itemsize} bytes"
+                f"{self.where}: the feature {name} has {len(values)} bytes; {META} says {dtype.name}"
+                f" {list(shape)}, a multiple of {abs(math.prod(shape)) * dtype.itemsize} bytes"
             ) from error
 
     def frames(self, name: str) -> np.ndarray:
@@ -149,10 +149,14 @@ class _Record:
             return array
         counts = self.array(LENGTH + name, (length,), np.dtype("<i4"))
         if counts.min() < 0 or counts.sum(dtype=np.int64) != len(array):
-            raise DatasetError(f"{self.where}: {LENGTH}{name} does not add up to the {len(array)} rows of {name}")
+            raise DatasetError(
+                f"{self.where}: {LENGTH}{name} does not add up to the {counted(len(array), 'row')} of {name}"
+            )
         if (counts != counts[0]).any():
             frame = int(np.argmax(counts != counts[0]))
-            self._fail_changing(f"{name} has {counts[0]} rows in frame 0 and {counts[frame]} in frame {frame}")
+            self._fail_changing(
+                f"{name} has {counted(counts[0], 'row')} in frame 0 and {counts[frame]} in frame {frame}"
+            )
         return array.reshape(length, counts[0], array.shape[1])
 
     def constant(self, name: str) -> np.ndarray:

@@ -23,7 +23,7 @@ from ast_sim.importers.solids.middles import NO_NODE, completed
 from ast_sim.importers.solids.stitching import Stitching
 from ast_sim.number_arrays import connected_parts
 from ast_sim.scene import NodeType, Scene
-from ast_sim.support.errors import DatasetError
+from ast_sim.support.errors import DatasetError, counted
 
 if TYPE_CHECKING:
     import meshio
@@ -111,7 +111,7 @@ class MeshFile:
         value = self.field(place, name)
         if value.shape[1] != 1:
             raise DatasetError(
-                f"{self.path}: the {place} field {name!r} has {value.shape[1]} components; must have one"
+                f"{self.path}: the {place} field {name!r} has {counted(value.shape[1], 'component')}; must have one"
             )
         return value[:, 0]
 
@@ -248,12 +248,12 @@ def mesh_of(mesh: SourceMesh, stitching: Stitching, corners: bool = False) -> Me
     point_of, joined = stitching.joined()
     taken = elements_of(mesh, point_of, corners)
     unused = len(mesh.points) - len(np.unique(np.concatenate([block.nodes.ravel() for block in mesh.blocks])))
-    told = [f"{unused} points of no element are left out"] if unused else []
+    told = [f"{counted(unused, 'point of no element is', 'points of no element are')} left out"] if unused else []
     groups = {name: np.unique(point_of[nodes]) for name, nodes in mesh.groups.items()}
     notes = [*mesh.notes, *joined]
     everyone = np.arange(len(mesh.points))
     shells, rows = _shells(mesh, point_of, taken)
-    notes += _counted(mesh, taken, rows) + taken.notes + told
+    notes += _told_of_cells(mesh, taken, rows) + taken.notes + told
     points, elements, node_rows, element_rows = mesh.points, taken.nodes, everyone, taken.rows
     if shells is not None:
         points = np.concatenate([points, shells.behind(points)])
@@ -273,7 +273,9 @@ def _of_second_order(mesh: MeshFile, middles: np.ndarray) -> MeshFile:
         name: np.concatenate([nodes, new[np.isin(edges, nodes).all(axis=1)]]) for name, nodes in mesh.groups.items()
     }
     if len(edges):
-        mesh.notes.append(f"{len(edges)} edges of elements that have corners only get a node in their middle")
+        of = "of elements that have corners only"
+        get = counted(len(edges), f"edge {of} gets a node in its", f"edges {of} get a node in their")
+        mesh.notes.append(f"{get} middle")
     return replace(
         mesh,
         points=np.concatenate([mesh.points, mesh.points[edges].mean(axis=1)]),
@@ -294,7 +296,7 @@ def _shells(mesh: SourceMesh, point_of: np.ndarray, taken: Elements) -> tuple[Sh
     return shells, np.concatenate(numbers)[shells.cells] if shells is not None else np.zeros(0, np.int64)
 
 
-def _counted(mesh: SourceMesh, taken: Elements, shell_rows: np.ndarray) -> list[str]:
+def _told_of_cells(mesh: SourceMesh, taken: Elements, shell_rows: np.ndarray) -> list[str]:
     """Notes on the cells that were left out or became shells, by kind."""
     ends = np.cumsum([len(block.nodes) for block in mesh.blocks])
     shells = Counter(mesh.blocks[index].label for index in np.searchsorted(ends, np.unique(shell_rows), "right"))
@@ -302,5 +304,17 @@ def _counted(mesh: SourceMesh, taken: Elements, shell_rows: np.ndarray) -> list[
     for index, block in enumerate(mesh.blocks):
         if index not in taken.blocks:
             left_out[block.label] += len(block.nodes)
-    told = {"are left out": left_out - shells, "are shells and become obstacles": shells}
-    return [f"{n} cells of the kind {kind} {what}" for what, count in told.items() for kind, n in count.items()]
+    told = [
+        f"{counted(n, f'cell of the kind {kind} is', f'cells of the kind {kind} are')} left out"
+        for kind, n in (left_out - shells).items()
+    ]
+    for kind, n in shells.items():
+        of_kind = f"of the kind {kind}"
+        told.append(
+            counted(
+                n,
+                f"cell {of_kind} is a shell and becomes an obstacle",
+                f"cells {of_kind} are shells and become obstacles",
+            )
+        )
+    return told

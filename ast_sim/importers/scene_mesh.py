@@ -16,7 +16,7 @@ from ast_sim.number_arrays import nodes_of_body, real_numbers
 from ast_sim.plausibility.topology import at_rest
 from ast_sim.scene import NodeType, Scene
 from ast_sim.support.argument_checks import file_name, in_short, require_bool, require_type, several
-from ast_sim.support.errors import ConfigError
+from ast_sim.support.errors import ConfigError, counted
 
 if TYPE_CHECKING:
     import meshio
@@ -119,15 +119,19 @@ def describe(scene: Scene) -> list[str]:
     """A line on the scene, and one on each body: its nodes by type, its elements, its bounding box."""
     kind = {3: "triangles", 4: "tetrahedra", 10: "second-order tetrahedra"}[scene.elements.shape[1]]
     body_of_element = scene.body[scene.elements[:, 0]]
-    lines = [f"{len(np.unique(scene.body))} bodies, {scene.num_nodes} nodes, {scene.num_elements} {kind}"]
+    lines = [
+        f"{counted(len(np.unique(scene.body)), 'body', 'bodies')}, {counted(scene.num_nodes, 'node')},"
+        f" {scene.num_elements:,} {kind}"
+    ]
     for body in np.unique(scene.body):
         nodes = scene.body == body
         counts = {t.name.lower(): int((scene.node_type[nodes] == t).sum()) for t in NodeType}
-        types = ", ".join(f"{count} {name}" for name, count in counts.items() if count)
+        types = ", ".join(f"{count:,} {name}" for name, count in counts.items() if count)
         points = scene.rest_position[nodes]
         box = zip("xyz", points.min(axis=0), points.max(axis=0), strict=True)
         extent = ", ".join(f"{axis} {low:.6g} to {high:.6g}" for axis, low, high in box)
-        lines.append(f"body {body}: {nodes.sum()} nodes ({types}), {(body_of_element == body).sum()} {kind}, {extent}")
+        elements = (body_of_element == body).sum()
+        lines.append(f"body {body}: {counted(nodes.sum(), 'node')} ({types}), {elements:,} {kind}, {extent}")
     return lines
 
 
@@ -176,7 +180,8 @@ def _node_type(
         if scene.elements.shape[1] != 3 and _on_a_line(mesh.points[used[held]]):
             body = scene.body[held[0]]
             doubts.append(
-                f"the clamp {clamp!r} holds {len(held)} nodes, which lie on a line: body {body} could turn around it"
+                f"the clamp {clamp!r} holds {counted(len(held), 'node')}, on one line, around which body {body} could"
+                " turn"
             )
     for body in several("obstacles", obstacles, "the numbers of bodies, such as [1]"):
         types[nodes_of_body(scene.body, body)] = NodeType.OBSTACLE

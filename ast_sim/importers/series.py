@@ -1,5 +1,4 @@
-"""Reading a simulation of another program: a PVD file, a folder with a file for each frame, or one file with all
-frames."""
+"""Reading a simulation of another program: a PVD file, a folder with a file for each frame, or one file for all."""
 
 from __future__ import annotations
 
@@ -40,7 +39,7 @@ from ast_sim.material import PRESSURES
 from ast_sim.plausibility.axes import MIRRORED
 from ast_sim.scene import NodeType, Scene, Trajectory
 from ast_sim.support.argument_checks import several
-from ast_sim.support.errors import ConfigError, DatasetError
+from ast_sim.support.errors import ConfigError, DatasetError, counted
 from ast_sim.support.toml_settings import require_range
 
 
@@ -266,7 +265,8 @@ def _displacement(frame: SourceMesh, names: FieldNames) -> np.ndarray | None:
     fields = parts or [names.displacement or "displacement"]
     value = np.concatenate([raw_field(frame, "point", one) for one in fields], axis=1)
     if value.shape[1] not in (2, 3):
-        raise DatasetError(f"{frame.path}: the displacement has {value.shape[1]} components; must have 2 or 3")
+        held = counted(value.shape[1], "component")
+        raise DatasetError(f"{frame.path}: the displacement has {held}; must have 2 or 3")
     if value.shape[1] == 2 and any(block.dimension == 3 for block in frame.blocks):
         raise DatasetError(f"{frame.path}: the displacement of a body with a volume has 2 components; must have 3")
     return np.pad(value, ((0, 0), (0, 3 - value.shape[1])))
@@ -292,7 +292,7 @@ def _stress(
     if not lacking.any():
         return stress, []
     stress[:, lacking] = 0
-    return stress, [f"the stress is NaN at {lacking.sum()} rows of obstacles: it is 0 there"]
+    return stress, [f"the stress is NaN at {counted(lacking.sum(), 'row')} of obstacles: it is 0 there"]
 
 
 def _material(mesh: MeshFile, names: FieldNames, of_job: bool) -> np.ndarray | None:

@@ -18,9 +18,9 @@ from ast_sim.number_arrays import connected_parts
 # The thickness of the layer, in mean edge lengths.
 _THICKNESS = 0.5
 
-# The share of a wall, and of the way to tetrahedra behind a shell, that the layer takes where it would take more than
-# half of the wall or reach the tetrahedra.
-_OF_WALL, _OF_WAY = 1 / 3, 1 / 200
+# The share of a wall, and of the distance to tetrahedra behind a shell, that the layer takes where it would take more
+# than half of the wall or reach the tetrahedra.
+_OF_WALL, _OF_ROOM = 1 / 3, 1 / 200
 
 # Where the normal of a node leads out through another triangle at it, the layer has this share of the usual thickness.
 _LEAST = 0.01
@@ -143,11 +143,11 @@ def _fitting(
     inwards = -_normals(points, triangles)[nodes]
     thickness = np.where(_sticks_out(points, triangles, inwards, nodes), _LEAST * thickness, thickness)
     start = points[nodes] + 1e-3 * thickness[:, None] * inwards  # behind the triangles that meet at the node
-    wall = _way_to(points, triangles, start, inwards)
+    wall = _distance_along(points, triangles, start, inwards)
     faces = tetrahedra[:, np.array(LOCAL_FACES)].reshape(-1, 3)
-    way = _way_to(points, faces, start, inwards)
+    room = _distance_along(points, faces, start, inwards)
     fitting = np.where(2 * thickness > wall, _OF_WALL * wall, thickness)
-    return np.where(way < wall, np.minimum(fitting, _OF_WAY * way), fitting)
+    return np.where(room < wall, np.minimum(fitting, _OF_ROOM * room), fitting)
 
 
 def _sticks_out(points: np.ndarray, triangles: np.ndarray, inwards: np.ndarray, nodes: np.ndarray) -> np.ndarray:
@@ -158,7 +158,7 @@ def _sticks_out(points: np.ndarray, triangles: np.ndarray, inwards: np.ndarray, 
     return np.bincount(corner[outwards], minlength=len(nodes)) > 0
 
 
-def _way_to(points: np.ndarray, triangles: np.ndarray, start: np.ndarray, direction: np.ndarray) -> np.ndarray:
+def _distance_along(points: np.ndarray, triangles: np.ndarray, start: np.ndarray, direction: np.ndarray) -> np.ndarray:
     """[n]: the distance from each start [n, 3] along its unit direction to the first triangle; inf if it meets none.
 
     A ray may pass between two triangles that share an edge, so three go each way, nearly parallel.

@@ -13,7 +13,7 @@ import numpy as np
 from ast_sim.importers.formats.source_mesh import SourceMesh
 from ast_sim.importers.frames_in_file import XDMF
 from ast_sim.importers.mesh_file import raw_field
-from ast_sim.support.errors import ConfigError, DatasetError
+from ast_sim.support.errors import ConfigError, DatasetError, counted
 
 # Where the six components stand if nobody says so: the three normal stresses, then the shear stresses. CalculiX, VTK,
 # Abaqus, LS-DYNA and Voigt's notation differ in the order of the shears alone, on which the von Mises stress does not
@@ -74,12 +74,14 @@ def order_of(
         return ()
     if columns not in _ORDERS:
         raise DatasetError(
-            f"{path}: the field {name!r} has {columns} components; must have one (von Mises stress), or 4, 6 or 9 of a"
-            " stress tensor"
+            f"{path}: the field {name!r} has {counted(columns, 'component')}; must have one (von Mises stress), or 4, 6"
+            " or 9 of a stress tensor"
         )
     if given:
         if len(given) != columns:
-            raise DatasetError(f"{path}: the field {name!r} has {columns} components, but the order names {len(given)}")
+            raise DatasetError(
+                f"{path}: the field {name!r} has {counted(columns, 'component')}, but the order names {len(given)}"
+            )
         if not _is_order(given):
             raise DatasetError(f"{path}: {', '.join(given)} is no order of the components of {name!r}")
         return given
@@ -93,7 +95,9 @@ def order_of(
         )
     doubt = _doubt_of_order(path, values)
     if doubt:
-        raise DatasetError(f"{path}: the order of the {columns} components of {name!r} is not certain: {doubt}")
+        raise DatasetError(
+            f"{path}: the order of the {counted(columns, 'component')} of {name!r} is not certain: {doubt}"
+        )
     return _ORDERS[columns]
 
 

@@ -64,7 +64,7 @@ class AnsweredFrame(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """The S wanted frames of a prediction, in the order in which they were asked for. After a failure some are missing.
+    """The S wanted frames of a prediction, in the order in which they were named. After a failure some are missing.
 
     Attributes:
         name, scene: of the question.
@@ -77,8 +77,8 @@ class Answer:
         source: the origin of the answer: attributes that `trajectory` gets.
         stress_location: where the rows of the stress are: "node" or "element".
         frames: the numbers of the S frames in the motion of the question.
-        seconds: the wall seconds from the question to the answer, with all that is prepared for the mesh. Several
-            questions that are asked together share their time equally.
+        seconds: the wall seconds from the call to the answer, with all that is prepared for the mesh. Several
+            scenes that are predicted together share their time equally.
         notes: what is unusual about the scene for the run, as sentences; they are warnings as well.
         latents: what the network made of each computed frame, [D] by number (`familiarity`).
         p_value: how usual the scene is beside the calibration scenes, up to 1; a note tells one of 0.05 or less.
@@ -180,7 +180,7 @@ class Answer:
         )
 
     def __iter__(self) -> Iterator[AnsweredFrame]:
-        """The frames, in the order in which they were asked for."""
+        """The frames, in the order in which they were named."""
         return map(self._frame, range(len(self.frames)))
 
     def plot(self, number: int | None = None) -> Figure:

@@ -17,6 +17,7 @@ from ast_sim.mechanics.physics_check import turned_over
 from ast_sim.models.model_config import ModelConfig
 from ast_sim.models.simulator import Simulator
 from ast_sim.ops import products_in
+from ast_sim.support.errors import counted
 from ast_sim.support.progress import ShowProgress
 
 
@@ -61,7 +62,9 @@ def doubts(answer: Answer) -> list[str]:
     counts = (turned_over(answer.scene, position) for position in answer.position)
     first = next(((frame, count) for frame, count in zip(answer.frames, counts, strict=False) if count), None)
     if first is not None:
-        told.append(f"{first[1]:.0f} elements are turned over in frame {first[0]}, which no body can do (Answer.check)")
+        frame, count = first
+        over = counted(int(count), "element is", "elements are")
+        told.append(f"{over} turned over in frame {frame}, which no body can do (Answer.check)")
     return told
 
 

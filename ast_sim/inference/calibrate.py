@@ -25,7 +25,7 @@ from ast_sim.runs.scope import spacing_of
 from ast_sim.scene import Trajectory
 from ast_sim.simulate.jobs.fastest_solver import deepest_frame
 from ast_sim.support.argument_checks import require_type
-from ast_sim.support.errors import ConfigError, warn
+from ast_sim.support.errors import ConfigError, counted, warn
 from ast_sim.support.progress import Progress, ShowProgress
 
 FEWEST = math.ceil(LEVEL / (1 - LEVEL) - 1e-9)  # scenes with which the rank of the quantile is at most their number
@@ -73,8 +73,8 @@ def calibrate(
             raise
     run.calibration = result
     if left_out:
-        told = f"{len(left_out)} scenes lie outside the training or do not move, the first is {left_out[0]}"
-        warn(f"{told}: they do not count")
+        count = counted(len(left_out), "scene does", "scenes do")
+        warn(f"{count} not count, outside the training or without motion; the first is {left_out[0]}")
     run.folder.keep_calibration(result.to_json())
     if run.path.is_file():
         warn(f"{run.path} is a file, which is not changed: Run.save writes one with the band")
@@ -174,7 +174,7 @@ def _quantiles(
         )
     if all(map(math.isinf, quantiles.get(DISPLACEMENT, ()))):
         failed = min(of_effort.count(None) for of_effort in zip(*scenes, strict=True))
-        raise ConfigError(f"{failed} of {len(scenes)} predictions failed: no band holds")
+        raise ConfigError(f"{failed} of {counted(len(scenes), 'prediction')} failed: no band holds")
     return quantiles, typical
 
 

@@ -16,7 +16,7 @@ from ast_sim.prescribed_motion import Motion, RigidMotion, Vector, frames_for
 from ast_sim.runs.scope import Scope, spacing_of
 from ast_sim.scene import Scene, Trajectory
 from ast_sim.support.argument_checks import in_short, require_line, require_type, several
-from ast_sim.support.errors import ConfigError, DatasetError
+from ast_sim.support.errors import ConfigError, DatasetError, counted
 from ast_sim.support.toml_settings import whole
 
 LEAST_RESOLVED = 0.01  # of a mean edge: rounding of the positions may be as large
@@ -79,7 +79,7 @@ def scenes_of(scenes: Any, names: Any) -> list[tuple[Scene, Motions, str]]:
     numbered = [f"scene {number}" for number in range(len(pairs))]
     called = numbered if names is None else several("names", names, "texts, one for each scene")
     if len(called) != len(pairs):
-        raise ConfigError(f"there are {len(called)} names for {len(pairs)} scenes")
+        raise ConfigError(f"there are {counted(len(called), 'name')} for {counted(len(pairs), 'scene')}")
     return [(scene, motion, name) for (scene, motion), name in zip(pairs, called, strict=True)]
 
 
@@ -100,7 +100,14 @@ def _loose(scene: Scene) -> list[str]:
     loose = ~scene.prescribed
     loose[scene.elements.ravel()] = False
     count = int(loose.sum())
-    return [f"{count} free nodes belong to no element: what is predicted for them means nothing"] if count else []
+    return (
+        [
+            f"{counted(count, 'free node belongs', 'free nodes belong')} to no element: what is predicted for them"
+            " means nothing"
+        ]
+        if count
+        else []
+    )
 
 
 def _require_whole(trajectory: Trajectory, config: ModelConfig, scope: Scope, name: str) -> None:

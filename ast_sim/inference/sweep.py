@@ -17,7 +17,7 @@ from ast_sim.models.model_config import ModelConfig
 from ast_sim.runs.scope import Scope
 from ast_sim.simulate.own_assembly.parameters import flattened
 from ast_sim.support.argument_checks import file_name
-from ast_sim.support.errors import ConfigError, warn
+from ast_sim.support.errors import ConfigError, counted, warn
 from ast_sim.support.progress import Progress, ShowProgress
 from ast_sim.view import sweep_files
 from ast_sim.view.files import make_folder
@@ -118,11 +118,14 @@ def sweep(
             bar.advance(names[-1], len(questions))
     outside = {note.partition(":")[0] for note in notes}
     if outside:
-        warn(f"{len(outside)} of {len(rows)} rows lie outside the training scenes; the first: {notes[0]}")
+        warn(
+            f"{len(outside)} of {counted(len(rows), 'row lies', 'rows lie')} outside the training scenes; the first:"
+            f" {notes[0]}"
+        )
     if unpromised:
         warn(
-            f"no error is promised in {unpromised} of {len(rows)} rows: their mesh or their ranges differ from the"
-            " calibration scenes"
+            f"no error is promised in {unpromised} of {counted(len(rows), 'row')}: their mesh or their ranges differ"
+            " from the calibration scenes"
         )
     return Sweep(table, _varied(rows, table), scope.length_unit, seconds)
 

@@ -57,7 +57,7 @@ class Trade:
 
     @property
     def figures(self) -> TradeFigures:
-        """Of the displacement."""
+        """The figures of the error of the displacement."""
         return self.by_quantity["displacement"]
 
     def __str__(self) -> str:

@@ -21,7 +21,7 @@ from ast_sim.mechanics.linearised.linearised_contact import CLEARANCE, NewtonSte
 from ast_sim.mechanics.solver import SolverSettings
 from ast_sim.plausibility.overlaps import nodes_inside
 from ast_sim.scene import Scene
-from ast_sim.support.errors import ConfigError, MissingExtra, SimulationError
+from ast_sim.support.errors import ConfigError, MissingExtra, SimulationError, counted
 
 TWICE = 1.5  # a closed surface winds once around what is inside, twice where two parts of it overlap
 SLIGHT_STRAIN = 1e-3  # the balance is relative to the force of this strain at least: smaller ones are hardly any
@@ -158,9 +158,12 @@ def check_physics(
     residual = "the worst force is {:.3g} times what the solver accepts"
     if law and forces and law.friction(scene):
         residual += "; with friction, its own frames have up to some 100,000"
+    inside_out = counted(int(max(turned, default=0)), "element is", "elements are")
+    inside = "inside another part of"
+    folded_in = counted(int(max(folded, default=0)), f"element lies {inside} its", f"elements lie {inside} their")
     return PhysicsCheck(
-        worst("elements turned over", turned, "{:.0f} elements are inside out: their stress means nothing", "none is"),
-        worst("elements folded in", folded, "{:.0f} elements lie inside another part of their own body", "none is"),
+        worst("elements turned over", turned, f"{inside_out} inside out: stress means nothing there", "none is"),
+        worst("elements folded in", folded, f"{folded_in} own body", "none is"),
         worst("deepest penetration", list(depths), f"a node lies {{:.3g}} {unit} inside another body", "none is"),
         worst("penetrated volume", list(volumes), f"bodies share about {{:.3g}} {unit}^3", "bodies share none"),
         worst("force residual", list(residuals), residual, "no force"),

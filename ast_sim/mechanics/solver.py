@@ -156,7 +156,7 @@ class Newton:
         """Bring the prescribed nodes to `target` [N,3] (rows of free nodes are ignored) and the others to equilibrium.
 
         Raises:
-            NotConverged: there is no equilibrium; the state is then somewhere on the way.
+            NotConverged: there is no equilibrium; the state is then between rest and the target.
         """
         self.restart(self.position)
         start = self.position

@@ -93,7 +93,7 @@ def proximity(
         radius: in the unit of position.
 
     Raises:
-        ValueError: a derivative or a transform of torch.func is asked for, a position is not finite, or the radius is
+        ValueError: a derivative or a transform of torch.func is wanted, a position is not finite, or the radius is
             not positive and finite.
     """
     if any(map(is_differentiated, (position, motion, offsets, body, surface, surface_offsets))):

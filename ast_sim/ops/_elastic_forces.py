@@ -157,7 +157,7 @@ def elastic_forces(position: Tensor, rest_position: Tensor, lame: Tensor, tets: 
         [N, 3] in newton, if positions are in metres; 0 for a node without elements.
 
     Raises:
-        ValueError: shapes do not fit the elements, or a gradient by rest_position or lame is asked for.
+        ValueError: shapes do not fit the elements, or rest_position or lame requires a gradient.
     """
     if torch.is_grad_enabled():
         for name, x in (("rest_position", rest_position), ("lame", lame)):

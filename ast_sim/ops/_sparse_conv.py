@@ -12,6 +12,7 @@ from ast_sim.ops._octree import CellMap
 from ast_sim.ops._segment import column_sum
 from ast_sim.ops.derivatives import differentiate, differentiate_by_composition
 from ast_sim.ops.library import Kernel, Op
+from ast_sim.support.errors import counted
 
 OFFSETS = 27
 
@@ -97,7 +98,7 @@ def sparse_conv(x: Tensor, weight: Tensor, map: CellMap, bias: Tensor | None = N
         ValueError: shapes do not fit each other or the map.
     """
     if x.shape[0] != map.num_fine:
-        raise ValueError(f"sparse_conv: x has {x.shape[0]} rows for {map.num_fine} fine cells")
+        raise ValueError(f"sparse_conv: x has {counted(x.shape[0], 'row')} for {counted(map.num_fine, 'fine cell')}")
     pairs = (map.fine, map.coarse_index, map.coarse_by_fine, map.fine_by_fine)
     return _conv(x, weight, bias, False, map.pair_offsets, *pairs, len(map.coarse.keys))
 
@@ -118,6 +119,9 @@ def sparse_conv_transposed(x: Tensor, weight: Tensor, map: CellMap, bias: Tensor
         ValueError: shapes do not fit each other or the map.
     """
     if x.shape[0] != len(map.coarse.keys):
-        raise ValueError(f"sparse_conv_transposed: x has {x.shape[0]} rows for {len(map.coarse.keys)} coarse cells")
+        raise ValueError(
+            f"sparse_conv_transposed: x has {counted(x.shape[0], 'row')} for"
+            f" {counted(len(map.coarse.keys), 'coarse cell')}"
+        )
     pairs = (map.coarse_by_fine, map.fine_by_fine, map.fine, map.coarse_index)
     return _conv(x, weight, bias, False, map.pair_offsets, *pairs, map.num_fine)

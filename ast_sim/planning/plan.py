@@ -21,7 +21,7 @@ from ast_sim.runs.config_toml import write_settings
 from ast_sim.runs.train_config import RunConfig
 from ast_sim.support.argument_checks import file_name, require_type
 from ast_sim.support.disk import write_json
-from ast_sim.support.errors import ConfigError
+from ast_sim.support.errors import ConfigError, counted
 from ast_sim.support.progress import Progress, ShowProgress, duration
 from ast_sim.support.provenance import provenance
 from ast_sim.support.toml_settings import require_range
@@ -37,7 +37,7 @@ class Plan:
     """What short trials say of a training. `str` gives what follows, in sentences.
 
     Attributes:
-        minutes, steps: of the training that is planned; the steps follow from the longest trial.
+        minutes, steps: the length of the planned training; the steps follow from the longest trial.
         trials: in the order in which they were made; the last one has half of the training scenes, the one before it is
             the longest of the best settings.
         settings: of the training, by dotted key, where they differ from the given ones.
@@ -99,7 +99,7 @@ def plan(
     Args:
         data: the dataset file, or the open dataset.
         out: folder for the trials, the figures (`plan.json`) and the settings to train with (`best.toml`).
-        minutes: of the training that is planned.
+        minutes: the length of the planned training.
         model, preset, state, model_settings, settings: as for `train`, without `minutes` and `steps`.
         progress: True: a line for each trial, on a terminal a bar; False: nothing is written, but the lines go to the
             logger "ast_sim"; or a function of (trials done, all trials, which one).
@@ -193,13 +193,17 @@ def _counted(config: RunConfig) -> tuple[int, int, int]:
         scenes = config.train.scenes or dataset.count("train")
         valid = dataset.count("valid")
         if scenes < LEAST_SCENES:
-            raise ConfigError(f"{dataset.path} has {scenes} training scenes; a plan needs {LEAST_SCENES} or more")
+            raise ConfigError(
+                f"{dataset.path} has {counted(scenes, 'training scene')}; a plan needs {LEAST_SCENES} or more"
+            )
         if valid == 0:
             raise ConfigError(f"{dataset.path} has no validation scenes, on which a plan judges its trials")
         return scenes, valid, sum(target_counts(dataset, "train")[:scenes])
 
 
 def _tell(trial: Trial, bar: Progress) -> None:
-    text = f"{trial.name}: {trial.steps:,} steps, {trial.scenes:,} scenes, error {percent(trial.error)}"
+    text = (
+        f"{trial.name}: {counted(trial.steps, 'step')}, {counted(trial.scenes, 'scene')}, error {percent(trial.error)}"
+    )
     bar.line(text)
     bar.advance(text)

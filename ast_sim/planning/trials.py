@@ -18,7 +18,7 @@ from ast_sim.runs.config_toml import has_config
 from ast_sim.runs.folder import RunFolder
 from ast_sim.runs.train_config import RunConfig
 from ast_sim.support.argument_checks import file_name
-from ast_sim.support.errors import ConfigError, TrainingError
+from ast_sim.support.errors import ConfigError, TrainingError, counted
 from ast_sim.training.callbacks import Callback
 from ast_sim.training.start import start_training
 
@@ -124,7 +124,7 @@ class Trials:
             checkpoint_every=steps,
             log_every=max(1, steps // 10),
         )
-        about = f"{name}, {steps} steps" + (f", {scenes} scenes" if scenes else "")
+        about = f"{name}, {counted(steps, 'step')}" + (f", {counted(scenes, 'scene')}" if scenes else "")
         folder = self.folder / about.replace(", ", "_").replace(" ", "-")
         changed = dataclasses.replace(config, train=options)
         start_training(folder, changed, resume=True, callback=callback, progress=False)
@@ -140,7 +140,7 @@ class Trials:
         """The steps of each candidate in the first round; a few steps are timed.
 
         Args:
-            minutes: of the training that is planned.
+            minutes: the length of the planned training.
 
         Raises:
             ConfigError: the trials would be too short.

@@ -36,8 +36,8 @@ class Worth:
 
     Attributes:
         spec: the specification.
-        minutes, steps: of the training.
-        scenes: of the training, which sees each frame `OFTEN` times.
+        minutes, steps: how long the training takes, and its number of steps.
+        scenes: the number of training scenes; the training sees each frame `OFTEN` times.
         workers: processes that solve scenes side by side.
         solve_seconds: processor time of the solver for a scene with all its frames, the median of `SOLVED`.
         answer_seconds: the median processor time of one call of the model for all frames of such a scene.
@@ -91,7 +91,7 @@ def worth(
     Args:
         spec: the specification of an assembly (TOML).
         out: folder for the scenes and a training of a few steps; a second call goes on with what is there.
-        minutes: of the training.
+        minutes: the length of the training.
         nodes, frames, solver, progress: as for `generate`.
 
     Raises:

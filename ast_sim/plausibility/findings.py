@@ -60,7 +60,8 @@ def _rows(findings: Findings) -> list[tuple[str, str, str]]:
         listed = ", ".join(names[:_PLACES]) + (", ..." if len(names) > _PLACES else "")
         several = f"in {len(names)} simulations ({listed}); " if len(names) > 1 else ""
         total = sum(finding.count for _, finding in of_kind)
-        rows.append((f"{total} {what}", f"{several}{name}: {first.places}", first.meaning))
+        counted = f"{total:,} {what}" if total > 1 else f"{what}: {total}"  # the noun is a plural
+        rows.append((counted, f"{several}{name}: {first.places}", first.meaning))
     return rows
 
 

@@ -46,13 +46,13 @@ def _stands_still(scene: Scene, moved: np.ndarray) -> list[Finding]:
     on = _size(np.diff(moved[:, ~scene.prescribed], axis=0))[1:]
     stands = np.array(steps) <= _STANDS * jump
     largest = _size(moved[:, ~scene.prescribed]).max()
-    way = on[stands].sum()
-    if jump <= _JUMP * largest or stands.mean() < _MOST or way <= _GOES_ON * largest:
+    travel = on[stands].sum()
+    if jump <= _JUMP * largest or stands.mean() < _MOST or travel <= _GOES_ON * largest:
         return []
     frames = np.flatnonzero(stands & (on > 0)) + frames_before - len(on)
     meaning = (
-        f"prescribed nodes jump once and then stand still, but others go on moving, by {way:.3g}: {_ADD_UP}. Else loads"
-        " or creep move them, which no scene has"
+        f"prescribed nodes jump once and then stand still, but others go on moving, by {travel:.3g}: {_ADD_UP}. Else"
+        " loads or creep move them, which no scene has"
     )
     return [Finding("frames in which only free nodes move", len(frames), places("frames", frames), meaning)]
 

@@ -39,10 +39,10 @@ class Chosen(NamedTuple):
 
 
 class RunFolder:
-    """The folder of a run. Each file is read once, when it is first asked for.
+    """The folder of a run. Each file is read once, when it is first needed.
 
     Raises:
-        CheckpointError: when it is asked for, a file is missing or damaged; the text names it.
+        CheckpointError: when it is read, a file is missing or damaged; the text names it.
         ConfigError: a file was edited.
     """
 
@@ -179,7 +179,7 @@ class RunFolder:
         """What `ast-sim info` says of a run: its settings, the checkpoint that it starts from, its checkpoints and the
         best validation.
 
-        A warning tells if the record of that validation is lost.
+        A warning tells if the record of that validation is missing.
         """
         latest, best, mark = checkpoint.latest(self.path), checkpoint.best(self.path), checkpoint.read_best(self.path)
         validation = self.metrics.validation(mark.step) if mark else None

@@ -10,7 +10,7 @@ from typing import Any
 
 from ast_sim.runs.sealed_line import seal, unseal
 from ast_sim.support.disk import write_text
-from ast_sim.support.errors import CheckpointError, warn
+from ast_sim.support.errors import CheckpointError, counted, warn
 
 METRICS = "metrics.jsonl"
 
@@ -31,7 +31,7 @@ class Metrics:
         if not self.path.exists():
             return
         if self.path.is_dir():
-            raise CheckpointError(f"{self.path} is a folder: remove it; only the curves of the training are lost")
+            raise CheckpointError(f"{self.path} is a folder: remove it, and with it only the curves of the training")
         damaged: list[str] = []
         number = 0
         with open(self.path, encoding="utf-8", errors="replace") as file:
@@ -41,7 +41,10 @@ class Metrics:
                 except ValueError as error:
                     damaged.append(f"line {number}: {error}")
         if damaged:
-            text = f"{self.path}: {len(damaged)} of {number} lines are damaged and left out, the first is {damaged[0]}"
+            text = (
+                f"{self.path}: {len(damaged)} of {counted(number, 'line is', 'lines are')} damaged and left out, the"
+                f" first is {damaged[0]}"
+            )
             warn(text)
 
     def append(self, record: dict[str, Any]) -> None:

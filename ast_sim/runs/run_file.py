@@ -65,7 +65,7 @@ class RunFile(RunFolder):
 
     Raises:
         CheckpointError: the file cannot be read, is damaged, or is of another version.
-        ConfigError: when the settings are asked for, the model that they name is not installed.
+        ConfigError: when the settings are read, the model that they name is not installed.
     """
 
     def __init__(self, path: Path) -> None:

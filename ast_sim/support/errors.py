@@ -81,6 +81,11 @@ def nearest_name(name: str, known: Iterable[str]) -> str:
     return f"; there are: {', '.join(known)}" if known else "; there are none"
 
 
+def counted(number: int, one: str, several: str = "") -> str:
+    """A number and what it counts: counted(3, "node") is "3 nodes"; `several` where that is not `one` with an s."""
+    return f"{number:,} {one}" if number == 1 else f"{number:,} {several or one + 's'}"
+
+
 def printable(text: str) -> str:
     """The text, with escapes for control characters, which a terminal would obey, and for bytes that are no text."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)

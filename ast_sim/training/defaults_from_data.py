@@ -12,7 +12,7 @@ from ast_sim.models.data_facts import DataFacts
 from ast_sim.models.model_config import ModelConfig
 from ast_sim.named_field import REACTION, STRESS
 from ast_sim.runs.train_config import RunConfig, TrainConfig
-from ast_sim.support.errors import ConfigError
+from ast_sim.support.errors import ConfigError, counted
 from ast_sim.support.toml_settings import LARGEST, require_range
 from ast_sim.training.data_lengths import DataScales
 from ast_sim.training.rates import Schedule
@@ -67,7 +67,7 @@ def _pairs_of_first(scenes: int, dataset: Dataset) -> int:
     require_range("train.scenes", scenes, 1)
     count = dataset.count("train")
     if scenes > count:
-        raise ConfigError(f"train.scenes is {scenes}, but {dataset.path} has {count} training scenes")
+        raise ConfigError(f"train.scenes is {scenes}, but {dataset.path} has {counted(count, 'training scene')}")
     return sum(target_counts(dataset, "train")[:scenes])
 
 
@@ -144,14 +144,14 @@ def _require_within_epoch(config: TrainConfig, pairs: int) -> None:
         most = max(pairs, getattr(usual, key))
         if getattr(config, key) > most:
             raise ConfigError(
-                f"train.{key} is {getattr(config, key)}, but an epoch has {pairs} samples: more would be the same ones"
-                f" again; take at most {most}"
+                f"train.{key} is {getattr(config, key)}, but an epoch has {counted(pairs, 'sample')}: more would be the"
+                f" same ones again; take at most {most}"
             )
     most = max(1, pairs // config.batch_size)
     if config.accumulate > most:
         raise ConfigError(
-            f"train.accumulate is {config.accumulate}, but an epoch has {pairs} samples: a step of batches of"
-            f" {config.batch_size} would see the same ones again; take at most {most}"
+            f"train.accumulate is {config.accumulate}, but an epoch has {counted(pairs, 'sample')}: a step of batches"
+            f" of {config.batch_size} would see the same ones again; take at most {most}"
         )
     if len(set(config.mirror)) < len(config.mirror):
         raise ConfigError(f"train.mirror is {', '.join(config.mirror[:10])}; name each axis once")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import statistics
 import time
 
-from ast_sim.support.errors import ConfigError
+from ast_sim.support.errors import ConfigError, counted
 from ast_sim.support.progress import duration
 from ast_sim.training.loop import Training, fit_statistics
 
@@ -34,7 +34,7 @@ def steps_within(minutes: float, training: Training) -> int:
     text = f"a step takes {1000 * step:.1f} ms, a validation {duration(validation)}"
     if count < 1:
         raise ConfigError(f"train.minutes is {minutes:g}, too few for one step: {text}")
-    training.progress.line(f"{minutes:g} min     {count:,} steps, since {text}")
+    training.progress.line(f"{minutes:g} min     {counted(count, 'step')}, since {text}")
     return count
 
 

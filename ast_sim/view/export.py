@@ -102,7 +102,7 @@ def _write_vtu(path: Path, elements: np.ndarray, shown: Fields, frame: int) -> N
 def _replacing_folder(folder: Path) -> Iterator[Path]:
     """A temporary folder that takes the place of `folder`, which must be absent or hold an earlier series."""
     if folder.exists() and not (folder.is_dir() and all(f.match("frame_*.vtu") for f in folder.iterdir())):
-        raise AstSimError(f"{folder} is in the way of the VTU files: it holds other files; choose another name")
+        raise AstSimError(f"{folder}, the folder for the VTU files, holds other files: choose another name")
     folder = Path(os.path.realpath(folder)) if folder.is_symlink() else folder
     temporary, old = temporary_name(folder), temporary_name(folder)
     try:

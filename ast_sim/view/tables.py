@@ -10,6 +10,7 @@ import numpy as np
 
 from ast_sim.figures import DeepestFrames, Figures, SceneFigures, main_nodes
 from ast_sim.number_arrays import measured_time
+from ast_sim.support.errors import counted
 from ast_sim.view.encode import Json
 
 DEFAULT_UNITS = {"displacement": "m", "stress": "Pa"}
@@ -121,7 +122,7 @@ def _speed_tiles(evaluation: Figures) -> list[Json]:
     model, solver = (median_of(evaluation, f"{who}_seconds_per_step") for who in ("model", "solver"))
     if model is None:
         return []
-    where = f" on {evaluation.threads} thread{'s' if evaluation.threads != 1 else ''}"
+    where = f" on {counted(evaluation.threads, 'thread')}"
     tile = {"label": "Time per step", "value": model, "unit": "s", "detail": f"median over the scenes{where}"}
     if solver:
         tile["detail"] = f"solver: {measured_time(solver)} on 1 thread; model{where}; medians"
@@ -142,7 +143,7 @@ def _scope_tiles(evaluation: Figures) -> list[Json]:
     failures = evaluation.failures
     detail = f"{np.mean([scene.nodes for scene in evaluation.scenes]):.0f} nodes on average"
     if failures:
-        detail = f"{failures} rollout{'s' if failures != 1 else ''} failed"
+        detail = f"{counted(failures, 'rollout')} failed"
     return [{"label": "Test scenes", "value": str(len(evaluation.scenes)), "detail": detail}]
 
 
@@ -245,7 +246,7 @@ def evaluation_facts(evaluation: Figures | None) -> dict[str, str]:
     versions = ", ".join(f"{name} {number}" for name, number in origin.get("versions", {}).items() if number)
     processor = origin.get("processor")
     if processor:
-        processor = f"{processor}, {evaluation.threads} thread{'s' if evaluation.threads != 1 else ''}"
+        processor = f"{processor}, {counted(evaluation.threads, 'thread')}"
     facts = {
         "Run": origin.get("run"),
         "Data file": origin.get("data"),

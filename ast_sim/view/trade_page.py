@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from ast_sim.number_arrays import measured_time, percent
+from ast_sim.support.errors import counted
 from ast_sim.support.progress import duration
 from ast_sim.trade_figures import WITHIN, Setting, TradeFigures, front
 from ast_sim.view import page
@@ -79,7 +80,10 @@ def _lead(figures: TradeFigures) -> str:
         if rows
     ]
     told = "; ".join(parts) or "neither is faster by the intervals" if figures.solver else "the solver was not run"
-    return f"{len(figures.scenes)} scenes that the run has not learned from. {figures.quantity.capitalize()}: {told}."
+    return (
+        f"{counted(len(figures.scenes), 'scene')} that the run has not learned from. {figures.quantity.capitalize()}:"
+        f" {told}."
+    )
 
 
 def _note(figures: TradeFigures) -> str:

@@ -64,7 +64,7 @@ def savings(run: ast_sim.Run, scene: ast_sim.Scene) -> list[Saving]:
 
     many = f"{len(TRAVELS)} questions about one mesh"
     return [
-        Saving("frames that are not asked for: 39 of 40, by one call", answer(CALL), answer(CALL, [-1])),
+        Saving("frames that are not wanted: 39 of 40, by one call", answer(CALL), answer(CALL, [-1])),
         Saving("the same, with a Newton step each", answer(NEWTON), answer(NEWTON, [-1])),
         Saving("a Newton step and all that it needs: one call instead", answer(NEWTON, [-1]), answer(CALL, [-1])),
         Saving("the solver's own stop test: one Newton step instead", answer(EXACT, [-1]), answer(NEWTON, [-1])),

@@ -13,7 +13,7 @@ _INTRODUCTION = """# Do bands and promised errors hold?
 
 Made by `python -m benchmarks.studies.coverage` from `benchmarks/results/coverage.json`; do not edit.
 
-Each run is calibrated on scenes that neither trained nor chose it, and is then asked for scenes that nobody has used.
+Each run is calibrated on scenes that neither trained nor chose it, and then predicts scenes that nobody has used.
 A band holds in a scene if no free node of any frame is farther from the simulated position than it says (or no force
 or largest stress of any frame is farther from the simulated one). A run's bands are made to hold in 95 of 100 scenes;
 beside them stand bands for 90 of 100, from the same calibration. How many of the fresh scenes they hold in varies by
@@ -25,7 +25,7 @@ no band.
 A wanted error (`predict(error=...)`) is kept if the error of the answer at the deepest frame is no larger. It is
 promised for 90 of 100 scenes, among the scenes without a warning.
 
-"Told" counts questions with a warning: scenes outside the ranges of the training, and scenes that the network finds
+"Either" counts scenes with a warning: scenes outside the ranges of the training, and scenes that the network finds
 unlike the calibration scenes (p-value at most 0.05: by chance one ordinary scene in twenty).
 """
 
@@ -62,7 +62,7 @@ def _section(result: dict[str, Any]) -> list[str]:
         f"{result['calibration_scenes']} calibration scenes. {sum(inside)} of {len(inside)} numbers are as expected.",
         *_table(["effort", "band of", *_COLUMNS], bands, texts=2),
         *_table(["error of", "wanted", "effort", "kept"], promises, texts=1),
-        *_table(["questions", "asked", "outside", "unlike", "told"], told, texts=1),
+        *_table(["scenes", "number", "outside the training", "unusual to the network", "either"], told, texts=1),
     ]
 
 

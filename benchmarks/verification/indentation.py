@@ -71,7 +71,7 @@ def hertz(cells: list[int]) -> Outcome:
             1.0,
             ratios[-1],
             0.05,
-            "what is asked of 8 cells a radius or more: 5 %",
+            "the limit for 8 cells a radius or more: 5 %",
         ),
         relative(
             "contact radius from the second moment of the pressure, in radii of Hertz",

@@ -134,7 +134,7 @@ def test_numbers_and_times_of_frames_travel_with_a_trajectory(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"frames": (0, 1)}, "frames has 2 numbers for 3 frames"),
+        ({"frames": (0, 1)}, "frames holds 2 numbers for 3 frames"),
         ({"frames": (0, 2, 2)}, r"frames must be whole numbers and ascend: \[0, 2, 2\]"),
         ({"frames": (-1, 0, 1)}, "frames starts at -1; the first frame of a motion is 0"),
         ({"times": (0.0, float("nan"), 1.0)}, "times must be finite and ascend"),
@@ -308,7 +308,7 @@ def test_a_wrong_trajectory_is_refused_and_nothing_stays(tmp_path):
     nan = Trajectory(good.scene, np.full_like(good.position, np.nan))
     for members, message in [
         ([good, nan], "train/000001: position in frame 0 at node 0 is not finite"),
-        ([good, with_material], "train/000001: has 4 nodes per element and 1 material columns"),
+        ([good, with_material], "train/000001: has 4 nodes per element and 1 material column;"),
         ([trajectory(good.scene, 2, stress="node")], "stress_location is 'none'"),
     ]:
         with pytest.raises(DatasetError, match=message):

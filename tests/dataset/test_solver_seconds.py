@@ -63,7 +63,7 @@ def test_damaged_seconds_are_unknown(path, content, message):
         ("train/000000", [-0.5, 1.0], "has times of train/000000 that are below 0 or not finite"),
         ("train/000000", [0.5, float("nan")], "has times of train/000000 that are below 0 or not finite"),
         ("train/000000", [0.0, 0.0], "says that train/000000 took no time"),
-        ("train/000000", [0.5], "has 1 times of train/000000, which has 2 frames"),
+        ("train/000000", [0.5], "has 1 time of train/000000, which has 2 frames"),
         ("train/000001", [0.5, 0.5], "has 2 times of train/000001, which has no frames"),
         ("train/000000", ["x"], "is damaged"),
     ],

@@ -141,7 +141,7 @@ def test_shells_as_tools(tmp_path, monkeypatch, capsys):
             cells = [("tetra", elements), ("quad", np.arange(4)[None] + n)]
             meshio.Mesh(points, cells, fields).write(folder / f"{frame}.vtu")
     with follow("--handle", "is_clamp") as dataset:
-        assert "1 cells of the kind quad are shells and become obstacles" in capsys.readouterr().out
+        assert "1 cell of the kind quad is a shell and becomes an obstacle" in capsys.readouterr().out
         found = dataset["test"][0]
         tool = found.scene.node_type == NodeType.OBSTACLE
         assert tool.sum() == 8 and found.scene.num_nodes in (48, 58)

@@ -400,7 +400,7 @@ def test_a_wrong_frame_is_named(tmp_path, case, capfd):
         (frame(), {"displacement": "U"}, "there is no point field 'U'; there are: none"),
         (frame(point={"a": np.ones(8)}), {"stress": "S"}, "there is no field 'S'; there are: a"),
         (frame(point={"S": np.ones((8, 5))}), {"stress": "S"}, "field 'S' has 5 components; must have one"),
-        (frame(point={"U": np.ones((8, 1))}), {"displacement": "U"}, "displacement has 1 components; must have 2 or 3"),
+        (frame(point={"U": np.ones((8, 1))}), {"displacement": "U"}, "displacement has 1 component; must have 2 or 3"),
         (frame(point={"node_type": np.full(8, 2)}), {}, "node 0 has the type 2"),
         (frame(point={"node_type": np.full(8, 300)}), {}, "node_type at node 0 is 300; must be a whole number"),
         (frame(point={"b": np.full(8, 0.5)}), {"body": "b"}, "b at node 0 is 0.5; must be a whole number"),

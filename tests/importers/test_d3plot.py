@@ -177,5 +177,5 @@ def test_elements_that_are_deleted_are_refused(tmp_path, dead, when):
     if dead is None:
         assert read_series(path, NAMES).scene.num_elements == 24
         return
-    with pytest.raises(DatasetError, match=f"d3plot: 1 elements are deleted at the time {TIMES[when]:g}, but all"):
+    with pytest.raises(DatasetError, match=f"d3plot: 1 element is deleted at the time {TIMES[when]:g}, but all"):
         read_series(path, NAMES)

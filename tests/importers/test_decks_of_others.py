@@ -56,7 +56,7 @@ def test_what_does_not_change_the_mesh_leaves_it_as_it_is(tmp_path, lines):
 @pytest.mark.parametrize(
     ("lines", "told"),
     [
-        (["*ELEMENT, TYPE=COH3D8", "2, 5, 6, 7, 8, 5, 6, 7, 8"], "1 elements of the type COH3D8 are left out"),
+        (["*ELEMENT, TYPE=COH3D8", "2, 5, 6, 7, 8, 5, 6, 7, 8"], "1 element of the type COH3D8 is left out"),
         (
             ["*ELEMENT, TYPE=vu12", "8, 1, 2, 3, 4", "9, 1, 2, 3, 4, 5,", "6, 7, 8"],
             "2 elements of the user's own type VU12 are left out: others have their nodes",
@@ -104,7 +104,7 @@ def test_an_instance_that_repeats_the_mesh_of_its_part_has_it_once(tmp_path):
     path = write(tmp_path, *part, "*INSTANCE, NAME=I, PART=P", *NODES, *CELL, "*END INSTANCE")
     mesh = read_mesh(path)
     assert len(mesh.points) == 8 and volume(path) == pytest.approx(1)
-    assert "1 elements that stand in the file twice are taken once" in mesh.notes
+    assert "1 element that stands in the file twice is taken once" in mesh.notes
 
 
 PLANE = np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0], [0, 1, 0], [1, 1, 0], [2, 1, 0], [3, 0, 0]], float)

@@ -36,13 +36,13 @@ def on_top(count):
 @pytest.mark.parametrize(
     ("kind", "count", "note"),
     [
-        ("R3D3", 3, "1 cells of the kind R3D3 are left out"),
-        ("r3d4", 4, "1 cells of the kind r3d4 are left out"),
-        ("SPRINGA", 2, "1 elements of the type SPRINGA are left out"),
-        ("Spring1", 1, "1 elements of the type SPRING1 are left out"),
-        ("DASHPOTA", 2, "1 elements of the type DASHPOTA are left out"),
-        ("MASS", 1, "1 elements of the type MASS are left out"),
-        ("T3D2", 2, "1 elements of the type T3D2 are left out"),
+        ("R3D3", 3, "1 cell of the kind R3D3 is left out"),
+        ("r3d4", 4, "1 cell of the kind r3d4 is left out"),
+        ("SPRINGA", 2, "1 element of the type SPRINGA is left out"),
+        ("Spring1", 1, "1 element of the type SPRING1 is left out"),
+        ("DASHPOTA", 2, "1 element of the type DASHPOTA is left out"),
+        ("MASS", 1, "1 element of the type MASS is left out"),
+        ("T3D2", 2, "1 element of the type T3D2 is left out"),
     ],
 )
 def test_elements_on_the_nodes_of_tetrahedra_are_left_out_with_a_note(tmp_path, kind, count, note):

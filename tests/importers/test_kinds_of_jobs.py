@@ -148,7 +148,7 @@ def test_nodes_in_a_plane_are_held_along_two_axes(tmp_path, kind):
     lines += ["7, 2, 2, -0.1", "8, 2, 2, -0.1", "9, 2, 2, -0.1", "*NODE FILE", "U", "*EL FILE", "S", "*END STEP"]
     result = read(solved(tmp_path, lines))
     assert np.flatnonzero(result.scene.node_type == NodeType.HANDLE).tolist() == [0, 1, 6, 7, 8]
-    assert "1 nodes are held in some directions only" in result.attributes["notes"]  # node 3 slides
+    assert "1 node is held in some directions only" in result.attributes["notes"]  # node 3 slides
     assert result.scene.elements.shape == (8, 3)
     way = result.position[1, 6:] - result.scene.rest_position[6:]
     np.testing.assert_allclose(way[:, 1:], [(-0.1, 0)] * 3, atol=1e-6)

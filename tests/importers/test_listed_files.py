@@ -110,7 +110,7 @@ def test_an_entry_of_another_kind_is_not_passed_over(folder, other):
     source = pvd(folder, A)
     last = '<DataSet timestep="3"  file="a_3.vtu"/>'
     source.write_text(source.read_text().replace(last, other.format('file="a_3.vtu"')))
-    with pytest.raises(DatasetError, match="all.pvd: 1 entries with a file are no DataSet right in a Collection"):
+    with pytest.raises(DatasetError, match="all.pvd: 1 entry with a file is no DataSet right in a Collection"):
         notes(source)
 
 

@@ -171,7 +171,7 @@ def test_a_solid_of_stl_may_end_in_two_words(tmp_path):
     mesh = read_mesh(tmp_path / "a.stl")
     assert mesh.elements.shape == (2, 3) and mesh.points[:, 0].max() == 2
     (tmp_path / "a.stl").write_text(f"solid WRAP\n{facet}")
-    with pytest.raises(DatasetError, match="a.stl: .* it is cut off after 1 facets"):
+    with pytest.raises(DatasetError, match="a.stl: .* it is cut off after 1 facet:"):
         read_mesh(tmp_path / "a.stl")
 
 

@@ -84,4 +84,4 @@ def test_a_part_without_an_instance_is_told(tmp_path):
 def test_a_section_of_a_body_of_revolution_is_told(tmp_path, kind, told):
     mesh = read(tmp_path, "*NODE", "1, 1, 0", "2, 2, 0", "3, 1, 1", f"*ELEMENT, TYPE={kind}", "1, 1, 2, 3")
     assert np.array_equal(mesh.elements, [[0, 1, 2]])
-    assert ("1 elements are sections of a body of revolution: they are taken as a plane" in mesh.notes) == told
+    assert ("1 element is a section of a body of revolution: taken as a plane" in mesh.notes) == told

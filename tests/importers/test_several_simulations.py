@@ -36,7 +36,7 @@ def test_a_simulation_that_stands_in_the_data_twice_is_told(tmp_path, recwarn):
     for name, press in (("a", 0.1), ("b", 0.05), ("c", 0.1)):
         write(tmp_path / name, press)
     lines, in_dataset = told(tmp_path, recwarn)
-    assert "1 simulations that stand in the data twice" in lines[1] and "c: as a" in lines[1]
+    assert "simulations that stand in the data twice: 1" in lines[1] and "c: as a" in lines[1]
     assert in_dataset == ["simulations that stand in the data twice"]
 
 

@@ -220,7 +220,7 @@ def test_newton_steps_end_when_one_is_small(pressed, monkeypatch):
     assert short.converged is False and short.last_steps == (pytest.approx(sizes[0], rel=1e-3),)
     assert answers(model, question, Effort(1))[0].converged is None
     found = deepest_frames(model, pressed, "test", Effort(1, 1))
-    assert found.not_converged == 1 and "in 1 of 1 scenes the Newton steps have not converged" in "\n".join(lines(found))
+    assert found.not_converged == 1 and "in 1 of 1 scene the Newton steps have not converged" in "\n".join(lines(found))
     assert deepest_frames(model, pressed, "test", Effort(1, 6)).not_converged == 0
 
 
@@ -304,7 +304,7 @@ def test_beside_the_solver(tmp_path):
     unmeshed = {name: VariantFigures(failure="could not be meshed: too thin") for name in halves}
     scene = replace(found.scenes[0], solver=replace(solver, variants={**solver.variants, **unmeshed}))
     assert lines(replace(found, scenes=(scene,)))[-1] == (
-        "  in 1 of 1 scenes the solver has no coarser mesh to begin on, also not for nested iteration: could not be"
+        "  in 1 of 1 scene the solver has no coarser mesh to begin on, also not for nested iteration: could not be"
         " meshed: too thin"
     )
     json.dumps(asdict(found), allow_nan=False)

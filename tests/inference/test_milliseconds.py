@@ -89,7 +89,7 @@ def test_other_questions_are_timed_again_and_a_damaged_file_is_no_obstacle(cache
         ({"ms": float("nan")}, "ms is nan; it must be a number above 0"),
         ({"ms": 0}, "ms is 0; it must be a number above 0"),
         ({"error": "2%"}, "the error of the displacement is '2%'; it must be a number, as 0.02 for 2 %"),
-        ({"error": {}}, "no error is asked for"),
+        ({"error": {}}, "no error is given"),
         ({"num_frames": 3.0}, "num_frames is 3.0; it must be a whole number"),
         ({"num_frames": True}, "num_frames is True; it must be a whole number"),
     ],

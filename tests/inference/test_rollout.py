@@ -151,5 +151,5 @@ def test_the_model_goes_on_when_a_node_leaves_the_domain():
 
 def test_a_trajectory_of_one_frame_cannot_be_rolled_out():
     truth = toy.plate(0)
-    with pytest.raises(RolloutError, match="one has 1 frames"):
+    with pytest.raises(RolloutError, match="one has 1 frame;"):
         toy.answer(model_of(), Trajectory(truth.scene, truth.position[:1], truth.stress[:1]), "one")

@@ -265,7 +265,7 @@ def test_a_lost_stretch_cannot_be_projected(first):
     ones = np.ones(20)
     arguments = F, np.ones((4, 3, 20)), ones, 1.0, ones, ones
     stiffness(*arguments, False)
-    with pytest.raises(np.linalg.LinAlgError, match="lost in rounding"):
+    with pytest.raises(np.linalg.LinAlgError, match="7e7 times another"):
         stiffness(*arguments, True)
 
 

@@ -124,7 +124,7 @@ def test_only_the_wanted_frames_are_computed(monkeypatch):
     for wrong in ([1.5], "last", [True], [[1, 2]], slice(1, None, 2.5), slice(None, None, 0)):
         with pytest.raises(ConfigError, match="frames must be whole numbers, one such number, or a slice, not"):
             Question.of(truth, "scene", wrong)
-    with pytest.raises(ConfigError, match="scene: frame 6 is asked for twice: name each frame once"):
+    with pytest.raises(ConfigError, match="scene: frame 6 is named twice: name each frame once"):
         Question.of(truth, "scene", [6, -1])
     np.testing.assert_allclose(last.position[0], every.position[6], rtol=0, atol=2e-6)
     for wrong, message in (([7], "has the frames 0 to 6; there is no frame 7"), ([], "name at least one frame")):

@@ -36,5 +36,5 @@ def test_damaged_lines_give_one_warning_with_their_number(tmp_path):
 
 def test_a_folder_in_place_of_the_file_is_one_clear_error(tmp_path):
     (tmp_path / "metrics.jsonl").mkdir()
-    with pytest.raises(CheckpointError, match=r"metrics.jsonl is a folder: remove it; only the curves"):
+    with pytest.raises(CheckpointError, match=r"metrics.jsonl is a folder: remove it, and with it only the curves"):
         list(Metrics(tmp_path))

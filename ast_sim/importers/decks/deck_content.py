@@ -20,7 +20,7 @@ from ast_sim.importers.decks.deck_numbers import elements_of, nodes_in, nodes_of
 from ast_sim.importers.decks.element_types import is_users_own, kind_of
 from ast_sim.importers.decks.keyword_lines import Keyword, read_keywords
 from ast_sim.importers.formats.source_mesh import node_count
-from ast_sim.support.errors import DatasetError
+from ast_sim.support.errors import DatasetError, counted
 
 # Keywords that make, move or remove nodes or elements, and that are not understood here.
 _CHANGE_THE_MESH = {
@@ -309,7 +309,9 @@ def _generated(keyword: Keyword) -> np.ndarray:
     for line in keyword.data:
         numbers = [whole(text, line) for text in tokens(line)]
         if len(numbers) not in (2, 3):
-            raise DatasetError(f"{line.place}: has {len(numbers)} numbers; must be the first, the last and the step")
+            raise DatasetError(
+                f"{line.place}: has {counted(len(numbers), 'number')}; must be the first, the last and the step"
+            )
         first, last, step = [*numbers, 1][:3]
         if step < 1 or last < first or (last - first) // step > 10**9:
             raise DatasetError(f"{line.place}: cannot count from {first} to {last} in steps of {step}")

@@ -11,7 +11,7 @@ import numpy as np
 from ast_sim.importers.decks.deck_content import Content, Deck, ElementBlock, Members, read_deck
 from ast_sim.importers.decks.element_types import REVOLVED
 from ast_sim.importers.formats.source_mesh import CellBlock, SourceMesh
-from ast_sim.support.errors import DatasetError
+from ast_sim.support.errors import DatasetError, counted
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +63,10 @@ class _Assembly:
         for name, part in deck.parts.items() if placed else ():
             if name not in placed and part.blocks:
                 count = sum(len(block.numbers) for block in part.blocks)
-                self.notes.append(f"the part {deck.written[name]} has no instance: its {count} elements are left out")
+                self.notes.append(
+                    f"the part {deck.written[name]} has no instance: its {counted(count, 'element is', 'elements are')}"
+                    " left out"
+                )
         self.blocks: list[CellBlock] = []
         self.elements: dict[str, tuple[np.ndarray, list[np.ndarray]]] = {}
 
@@ -77,7 +80,10 @@ class _Assembly:
             same = points[last[np.searchsorted(unique, numbers)]] == points
             changed = len(np.unique(numbers[~same.all(axis=1)]))
             if changed:
-                self.notes.append(f"{changed} nodes stand in the deck more than once: the last place counts")
+                self.notes.append(
+                    f"{counted(changed, 'node stands', 'nodes stand')} in the deck more than once: the last place"
+                    " counts"
+                )
         start = sum(len(scope.numbers) for scope in self.scopes.values())
         self.scopes[name] = _Scope(name, unique, points[last] @ rotation.T + shift, start, contents)
 
@@ -98,16 +104,18 @@ class _Assembly:
                 held += ", and continues another job (*RESTART, READ), whose deck has the mesh"
             raise DatasetError(f"{self.deck.path}: holds {held}: a scene needs elements of a volume")
         notes = [*self.notes]
-        notes += [f"{count} elements of the type {name} are left out" for name, count in self.deck.left_out.items()]
+        for name, count in self.deck.left_out.items():
+            kind = f"of the type {name}"
+            notes.append(f"{counted(count, f'element {kind} is', f'elements {kind} are')} left out")
         if self.deck.formulas:
             notes.append(
                 f"rigid surfaces without elements are left out: {', '.join(self.deck.formulas)}; a tool needs a mesh,"
                 " for example of R3D4"
             )
         turned = sum(len(block.nodes) for block in self.blocks if block.label.startswith(REVOLVED))
-        notes += (
-            [f"{turned} elements are sections of a body of revolution: they are taken as a plane"] if turned else []
-        )
+        if turned:
+            are = counted(turned, "element is a section", "elements are sections")
+            notes.append(f"{are} of a body of revolution: taken as a plane")
         ignored = self.deck.ignored.keys() - set(understood)
         if ignored:
             notes.append(f"ignored keywords: {', '.join(sorted(ignored))}")
@@ -151,11 +159,12 @@ class _Assembly:
             if alone:
                 raise one.keyword.error(
                     f"elements of the type {one.type_name} are the user's own, so their shape is not known, and {alone}"
-                    f" of their {len(one.nodes)} nodes belong to no other element: write them as C3D8, C3D4 or alike"
+                    f" of their {counted(len(one.nodes), 'node belongs', 'nodes belong')} to no other element: write"
+                    " them as C3D8, C3D4 or alike"
                 )
-            self.notes.append(
-                f"{one.how_many} elements of the user's own type {one.type_name} are left out: others have their nodes"
-            )
+            kind = f"of the user's own type {one.type_name}"
+            left_out = counted(one.how_many, f"element {kind} is", f"elements {kind} are")
+            self.notes.append(f"{left_out} left out: others have their nodes")
 
     def _places(self, scope: _Scope, block: ElementBlock) -> np.ndarray:
         """[c, k]: where the nodes of elements are in the mesh."""

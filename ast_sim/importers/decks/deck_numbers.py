@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ast_sim.importers.decks.keyword_lines import Keyword, Line
-from ast_sim.support.errors import DatasetError
+from ast_sim.support.errors import DatasetError, counted
 
 # Fortran writes 4.2D+00, and 4.2+100 where an exponent has three digits.
 _FORTRAN = re.compile(r"^([-+]?[0-9.]+)(?:[dDeE])?([-+][0-9]+)$")
@@ -82,14 +82,16 @@ def elements_of(keyword: Keyword, count: int) -> tuple[np.ndarray, list[list[str
             rows.append([])
         rows[-1].extend(entries)
         if len(rows[-1]) > count:
-            raise DatasetError(f"{line.place}: element {numbers[-1]} has {len(rows[-1])} nodes; its type has {count}")
+            raise DatasetError(
+                f"{line.place}: element {numbers[-1]} has {counted(len(rows[-1]), 'node')}; its type has {count}"
+            )
         for text in entries:
             if not re.fullmatch(r"\+?[0-9]{1,18}", text):
                 named = named or "." in text
                 if "." not in text:
                     raise DatasetError(f"{line.place}: {text!r} is no number of a node")
     if rows and len(rows[-1]) < count:
-        raise keyword.error(f"element {numbers[-1]} has {len(rows[-1])} nodes; its type has {count}")
+        raise keyword.error(f"element {numbers[-1]} has {counted(len(rows[-1]), 'node')}; its type has {count}")
     if named:
         return np.array(numbers, np.int64), rows
     return np.array(numbers, np.int64), np.array(rows, np.int64).reshape(-1, count)

@@ -20,7 +20,7 @@ import h5py
 import numpy as np
 from scipy.io import netcdf_file
 
-from ast_sim.support.errors import DatasetError
+from ast_sim.support.errors import DatasetError, counted
 
 # No linear or quadratic cell of VTK has more nodes, apart from Lagrange cells of a high order.
 _MOST_NODES = 216
@@ -160,7 +160,8 @@ def _require_sizes(path: Path, declared: Declared) -> None:
     for points, cells in declared.pieces:
         if points + cells > ratio * size:
             raise DatasetError(
-                f"{path}: declares {points} points and {cells} cells, more than a file of {size} bytes can hold"
+                f"{path}: declares {counted(points, 'point')} and {counted(cells, 'cell')}, more than a file of"
+                f" {size:,} bytes can hold"
             )
     with path.open("rb") as file:
         for array in declared.arrays:

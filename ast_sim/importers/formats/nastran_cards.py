@@ -65,9 +65,9 @@ def plain_nastran(path: Path) -> bytes:
             cells += _plain_element(path, place, name, fields)
     if not points:
         raise DatasetError(f"{path}: cannot be read as a mesh: holds no GRID, so it is no deck of Nastran; {INSTEAD}")
-    lost = {node for row in cells for node in row.split(",")[1 if row[0] == "+" else 3 :]} - points.keys()
-    if lost:
-        raise DatasetError(f"{path}: an element has the node {min(lost)}, and there is no GRID of this number")
+    missing = {node for row in cells for node in row.split(",")[1 if row[0] == "+" else 3 :]} - points.keys()
+    if missing:
+        raise DatasetError(f"{path}: an element has the node {min(missing)}, and there is no GRID of this number")
     return "\n".join(["BEGIN BULK", *points.values(), *cells, "ENDDATA\n"]).encode()
 
 

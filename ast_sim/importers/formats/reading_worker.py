@@ -277,7 +277,7 @@ def _exodus(path: Path) -> _Opened:
     for kind in (Reader.NODAL, Reader.ELEM_BLOCK, Reader.NODE_SET):
         reader.SetAllArrayStatus(kind, 1)
     for index in range(reader.GetNumberOfObjects(Reader.NODE_SET)):
-        reader.SetObjectStatus(Reader.NODE_SET, index, 1)  # VTK leaves sets out unless it is asked for them
+        reader.SetObjectStatus(Reader.NODE_SET, index, 1)  # VTK leaves sets out unless they are enabled
     facts = {"declared": [reader.GetTotalNumberOfNodes(), reader.GetTotalNumberOfElements()]}
     return _Opened(reader, _times(reader), reader.SetTimeStep, facts)
 

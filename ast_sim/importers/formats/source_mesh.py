@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ast_sim.number_arrays import require_nodes
-from ast_sim.support.errors import DatasetError
+from ast_sim.support.errors import DatasetError, counted
 
 if TYPE_CHECKING:
     import meshio
@@ -120,8 +120,8 @@ class SourceMesh:
         for block in self.blocks:
             if block.dimension and block.nodes.shape[1:] != (node_count(block.kind),):
                 raise DatasetError(
-                    f"{self.path}: cells of the kind {block.label} have {block.nodes.shape[1]} nodes; must have"
-                    f" {node_count(block.kind)}: are lines of the file missing or cut short?"
+                    f"{self.path}: cells of the kind {block.label} have {counted(block.nodes.shape[1], 'node')}; must"
+                    f" have {node_count(block.kind)}: are lines of the file missing or cut short?"
                 )
             require_nodes(str(self.path), block.label, block.nodes, len(self.points))
             used[block.nodes] = True
@@ -137,7 +137,7 @@ class SourceMesh:
 
     def _require_rows(self, what: str, rows: int, wanted: int) -> None:
         if rows != wanted:
-            raise DatasetError(f"{self.path}: the {what} has {rows} rows; must have {wanted}")
+            raise DatasetError(f"{self.path}: the {what} has {counted(rows, 'row')}; must have {wanted}")
 
     def counts(self) -> Counter[str]:
         """How many cells of each label there are."""

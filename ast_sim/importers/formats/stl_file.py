@@ -11,6 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
+from ast_sim.support.errors import counted
+
 _HEADER = 84
 _MARK = b"\xef\xbb\xbf"  # with which some editors of Windows begin a text
 _TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("colour", "<u2")])
@@ -67,13 +69,17 @@ def _is_text(data: bytes) -> bool:
 
 def _binary(data: bytes) -> StlFile:
     if len(data) < _HEADER:
-        raise BadSurface(f"it has {len(data)} bytes: neither a text that begins with 'solid' nor a binary STL file")
+        raise BadSurface(
+            f"it has {counted(len(data), 'byte')}: neither a text that begins with 'solid' nor a binary STL file"
+        )
     count = int.from_bytes(data[80:84], "little")
     held, left = divmod(len(data) - _HEADER, _TRIANGLE.itemsize)
     if held < count:
-        raise BadSurface(f"it is cut off: it says {count:,} triangles, but holds {held:,}")
+        raise BadSurface(f"it is cut off: it says {counted(count, 'triangle')}, but holds {held:,}")
     if left or held > count:
-        raise BadSurface(f"it says {count:,} triangles, but has {len(data) - _HEADER:,} bytes of them, 50 each")
+        raise BadSurface(
+            f"it says {counted(count, 'triangle')}, but has {counted(len(data) - _HEADER, 'byte')} of them, 50 each"
+        )
     rows = np.frombuffer(data, _TRIANGLE, count, _HEADER)
     return StlFile(rows["corners"].astype(np.float64), np.zeros(count, int), ("",))
 
@@ -99,9 +105,12 @@ def _facets(block: bytes) -> np.ndarray:
     vertex = np.flatnonzero(words == b"vertex")
     facets = int((words == b"facet").sum())
     if end is None or int((words == b"endfacet").sum()) != facets:
-        raise BadSurface(f"it is cut off after {facets:,} facets: 'endfacet' or 'endsolid' is missing")
+        raise BadSurface(f"it is cut off after {counted(facets, 'facet')}: 'endfacet' or 'endsolid' is missing")
     if len(vertex) != 3 * facets:
-        raise BadSurface(f"it holds {facets:,} facets, but {len(vertex):,} vertices; each facet has three")
+        raise BadSurface(
+            f"it holds {counted(facets, 'facet')}, but {counted(len(vertex), 'vertex', 'vertices')}; each facet has"
+            " three"
+        )
     if not facets:
         return np.zeros((0, 3, 3))
     numbers = words[np.minimum(vertex[:, None] + np.arange(1, 4), len(words) - 1)]

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from ast_sim.importers.formats.source_mesh import SourceMesh
-from ast_sim.support.errors import DatasetError
+from ast_sim.support.errors import DatasetError, counted
 
 
 def labels_of(files: Sequence[str]) -> list[str]:
@@ -113,7 +113,7 @@ def _filled(parts: list[tuple[dict[str, np.ndarray], int]]) -> tuple[dict[str, n
             continue
         lacking = sum(rows for values, rows in given if values is None)
         if lacking:
-            notes.append(f"the field {name!r} is missing in some blocks: it is NaN in {lacking} rows")
+            notes.append(f"the field {name!r} is missing in some blocks: it is NaN in {counted(lacking, 'row')}")
         empty = [np.full((rows, *there[0].shape[1:]), np.nan) for values, rows in given if values is None]
         fields[name] = np.concatenate([v if v is not None else empty.pop(0) for v, _ in given])
     return fields, notes

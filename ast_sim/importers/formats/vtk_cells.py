@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ast_sim.importers.formats.source_mesh import BEZIER, SHAPES, CellBlock, node_count
-from ast_sim.support.errors import DatasetError
+from ast_sim.support.errors import DatasetError, counted
 
 # Types of VTK with a fixed number of nodes.
 _KINDS = {
@@ -87,19 +87,21 @@ def _block(path: Path, number: int, size: int, nodes: np.ndarray) -> CellBlock:
     if number == 7 and size in (3, 4):
         return CellBlock("triangle" if size == 3 else "quad", nodes, "polygon")
     if kind is None:
-        what = _REFUSED.get(number, f"cells of VTK's type {number} with {size} nodes")
+        what = _REFUSED.get(number, f"cells of VTK's type {number} with {counted(size, 'node')}")
         raise DatasetError(f"{path}: holds {what}, which are not known here: mesh the bodies with tetrahedra")
     if kind in _REORDERED:
         shape, order = _REORDERED[kind]
         if size != len(order):
-            raise DatasetError(f"{path}: cannot be read as a mesh: a {kind} has {size} nodes")
+            raise DatasetError(f"{path}: cannot be read as a mesh: a {kind} has {counted(size, 'node')}")
         return CellBlock(shape, nodes[:, order], kind)
     if size != node_count(kind):
-        raise DatasetError(f"{path}: cannot be read as a mesh: a {kind} has {size} nodes")
+        raise DatasetError(f"{path}: cannot be read as a mesh: a {kind} has {counted(size, 'node')}")
     return CellBlock(kind, nodes, kind)
 
 
 def _require_size(path: Path, block: CellBlock, least: int) -> CellBlock:
     if block.nodes.shape[1] < least:
-        raise DatasetError(f"{path}: cannot be read as a mesh: a {block.label} has {block.nodes.shape[1]} nodes")
+        raise DatasetError(
+            f"{path}: cannot be read as a mesh: a {block.label} has {counted(block.nodes.shape[1], 'node')}"
+        )
     return block

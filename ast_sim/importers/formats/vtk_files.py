@@ -36,7 +36,7 @@ from ast_sim.importers.formats.source_mesh import SourceMesh
 from ast_sim.importers.formats.together import labels_of, together
 from ast_sim.importers.formats.vtk_cells import blocks_of
 from ast_sim.support.environment import of_child
-from ast_sim.support.errors import DatasetError, require
+from ast_sim.support.errors import DatasetError, counted, require
 
 READING_MODULE = "ast_sim.importers.formats.reading_worker"
 EXODUS = (".e", ".ex2", ".exo", ".exoii", ".exii", ".g", ".gen")
@@ -91,7 +91,7 @@ def vtk_frames(path: Path) -> Iterator[SourceMesh]:
         declared = of_steps[step] if step < len(of_steps) else head.get("declared")
         declared = declared or ([sum(column) for column in zip(*pieces, strict=True)] if pieces else None)
         more = sum(int(part["more"][0]) for part in parts if "more" in part)
-        mesh.notes.extend([f"polygons and strips are cut into triangles: {more} more cells"] if more else [])
+        mesh.notes.extend([f"polygons and strips are cut into triangles: {counted(more, 'more cell')}"] if more else [])
         _require_counts(mesh, declared and [declared[0], declared[1] + more])
         if is_dyna(path):
             _require_no_deleted(mesh)
@@ -135,12 +135,14 @@ def _require_counts(mesh: SourceMesh, declared: list[int] | None) -> None:
     if mesh.path.suffix.lower() in EXODUS and mesh.same_point is not None:
         points = len(np.unique(mesh.same_point))  # each block has its own copies of the points that it uses
         if points < declared[0]:
-            mesh.notes.append(f"{declared[0] - points} points of no element are left out")
+            mesh.notes.append(
+                f"{counted(declared[0] - points, 'point of no element is', 'points of no element are')} left out"
+            )
             points = declared[0]
     if declared != [points, cells]:
         raise DatasetError(
-            f"{mesh.path}: says that it holds {declared[0]} points and {declared[1]} cells, but VTK reads {points} and"
-            f" {cells}"
+            f"{mesh.path}: says that it holds {counted(declared[0], 'point')} and {counted(declared[1], 'cell')}, but"
+            f" VTK reads {points:,} and {cells}"
         )
 
 
@@ -150,8 +152,8 @@ def _require_no_deleted(mesh: SourceMesh) -> None:
     if deleted:
         at = "" if mesh.time is None else f" at the time {mesh.time:g}"
         raise DatasetError(
-            f"{mesh.path}: {deleted} elements are deleted{at}, but all frames of a scene have the same ones: end the"
-            " results before"
+            f"{mesh.path}: {counted(deleted, 'element is', 'elements are')} deleted{at}, but all frames of a scene have"
+            " the same ones: end the results before"
         )
 
 
@@ -342,5 +344,5 @@ def _without_ghosts(mesh: SourceMesh) -> SourceMesh:
     fields = {
         name: [v[rows] for v, rows in zip(values, kept, strict=True)] for name, values in mesh.cell_fields.items()
     }
-    notes = [*mesh.notes, *([f"{left_out} ghost cells are left out"] if left_out else [])]
+    notes = [*mesh.notes, *([f"{counted(left_out, 'ghost cell is', 'ghost cells are')} left out"] if left_out else [])]
     return replace(mesh, blocks=blocks, cell_fields=fields, notes=notes)

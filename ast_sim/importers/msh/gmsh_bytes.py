@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ast_sim.support.errors import DatasetError
+from ast_sim.support.errors import DatasetError, counted
 
 _VERSIONS = (1.0, 2.0, 2.1, 2.2, 4.1)
 
@@ -48,7 +48,7 @@ class Section:
         """Raise ValueError if the rest of the file is too short for `count` numbers."""
         left = len(self.content) - self.place if self.tokens is None else len(self.tokens) - self.next_token
         if count < 0 or count * (size if self.order else 1) > left:
-            raise ValueError(f"it declares {count} entries, but the file does not hold them")
+            raise ValueError(f"it declares {counted(count, 'entry', 'entries')}, but the file does not hold them")
 
     def _numbers(self, count: int, kind: str) -> np.ndarray:
         self.require(count, int(kind[1]))
@@ -118,7 +118,7 @@ class Section:
                 kind, block, tags = self.ints(3).tolist()
                 width = 1 + tags + nodes(kind)
                 if not 0 < block <= count - done:
-                    raise ValueError(f"a block of {block} elements, where {count - done} are left")
+                    raise ValueError(f"a block of {counted(block, 'element')}, where {count - done:,} are left")
                 yield kind, tags, self.ints(block * width).reshape(block, width)
                 done += block
             return
@@ -131,11 +131,11 @@ class Section:
                 entries[2:5] = [b"2", *entries[2:4]]
             kind, tags = int(entries[1]), int(entries[2])
             if len(entries) != 3 + tags + nodes(kind):
-                raise ValueError(f"element {int(entries[0])} has {len(entries) - 3 - tags} nodes")
+                raise ValueError(f"element {int(entries[0])} has {counted(len(entries) - 3 - tags, 'node')}")
             by_form.setdefault((kind, tags), []).append([entries[0], *entries[3:]])
         if sum(map(len, by_form.values())) != count:
             held = sum(map(len, by_form.values()))
-            raise ValueError(f"it says that it holds {count} elements, but there are {held}")
+            raise ValueError(f"it says that it holds {counted(count, 'element')}, but there are {held:,}")
         for (kind, tags), rows in by_form.items():
             yield kind, tags, np.array(rows).astype(np.int64)
 

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ast_sim.importers.formats.source_mesh import SourceMesh
-from ast_sim.support.errors import DatasetError
+from ast_sim.support.errors import DatasetError, counted
 
 # The beginning of a section with a field: one text, which is its name, one real number, the time, and the step.
 _HEADER = re.compile(
@@ -100,8 +100,9 @@ def _steps(path: Path, by_field: dict[tuple[bool, str], dict[Step, list[GmshFiel
     other = next((name for name, steps in others if set(steps) != set(usual)), None)
     if other is not None:
         raise DatasetError(
-            f"{path}: the field {first!r} has {len(usual)} steps, from the time {usual[0][0]:g} on, {other!r} has"
-            f" {len(several[other])}, from {several[other][0][0]:g} on: write all fields at the same steps and times"
+            f"{path}: the field {first!r} has {counted(len(usual), 'step')}, from the time {usual[0][0]:g} on,"
+            f" {other!r} has {len(several[other])}, from {several[other][0][0]:g} on: write all fields at the same"
+            " steps and times"
         )
     steps = sorted(usual)
     times, numbers = (list(column) for column in zip(*steps, strict=True))
@@ -123,7 +124,7 @@ def _together(path: Path, name: str, parts: Sequence[GmshField]) -> tuple[np.nda
     differ = (values != values[first[row.ravel()]]).any(axis=1)
     if len(unique) < len(numbers) and differ.any():
         raise DatasetError(
-            f"{path}: the field {name!r} has two values for {differ.sum()} numbers, such as"
+            f"{path}: the field {name!r} has two values for {counted(differ.sum(), 'number')}, such as"
             f" {numbers[np.argmax(differ)]}, at one step and time: give each step a number or a time of its own"
         )
     return numbers, values

@@ -17,7 +17,7 @@ import numpy as np
 from ast_sim.importers.formats.source_mesh import CellBlock, SourceMesh, node_count
 from ast_sim.importers.msh.gmsh_bytes import Reader, Section
 from ast_sim.importers.msh.gmsh_fields import GmshField, with_fields
-from ast_sim.support.errors import DatasetError
+from ast_sim.support.errors import DatasetError, counted
 
 # Gmsh's types of elements.
 _KINDS = {
@@ -166,7 +166,7 @@ def _nodes_4(section: Section, content: _Content) -> None:
         points.append(section.reals(columns * count).reshape(count, columns)[:, :3])
     content.node_numbers, content.points = np.concatenate(numbers), np.concatenate(points)
     if len(content.node_numbers) != total:
-        raise ValueError(f"it says that it holds {total} nodes, but there are {len(content.node_numbers)}")
+        raise ValueError(f"it says that it holds {counted(total, 'node')}, but there are {len(content.node_numbers):,}")
 
 
 def _elements_4(section: Section, content: _Content) -> None:
@@ -185,7 +185,7 @@ def _elements_4(section: Section, content: _Content) -> None:
         )
         held += count
     if held != total:
-        raise ValueError(f"it says that it holds {total} elements, but there are {held}")
+        raise ValueError(f"it says that it holds {counted(total, 'element')}, but there are {held:,}")
 
 
 def _nodes_2(section: Section, content: _Content) -> None:

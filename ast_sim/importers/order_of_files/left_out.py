@@ -9,6 +9,7 @@ from pathlib import Path
 from ast_sim.importers.formats.vtk_files import BLOCKS
 from ast_sim.importers.frames_in_file import ONE_FRAME, holds_frames
 from ast_sim.importers.order_of_files.by_name import natural_order
+from ast_sim.support.errors import counted
 
 # Files that list other files, and how.
 _LISTING = (".pvd", ".series", ".pvtu", ".pvtp", ".pvts", *BLOCKS)
@@ -26,7 +27,9 @@ def left_out(folder: Path, taken: Iterable[Path]) -> list[str]:
     if not others:
         return []
     named = ", ".join(other.name for other in others[:3]) + (", ..." if len(others) > 3 else "")
-    return [f"{len(others)} other files or folders with results in {folder.name} are left out: {named}"]
+    where = f"with results in {folder.name}"
+    left_out = counted(len(others), f"other file or folder {where} is", f"other files or folders {where} are")
+    return [f"{left_out} left out: {named}"]
 
 
 def _results_in(entry: Path) -> Iterator[Path]:

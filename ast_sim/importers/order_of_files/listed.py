@@ -14,7 +14,7 @@ from ast_sim.importers.formats.together import labels_of
 from ast_sim.importers.frames_in_file import ONE_FRAME
 from ast_sim.importers.order_of_files.by_name import natural_order
 from ast_sim.importers.order_of_files.doubts import doubts_of_listed
-from ast_sim.support.errors import DatasetError
+from ast_sim.support.errors import DatasetError, counted
 
 # ParaView's files that list the files of frames with their times: run.vtu.series beside run_0.vtu.
 SERIES = ".series"
@@ -49,7 +49,8 @@ def in_collection(source: Path) -> FrameFiles:
     others = sum("file" in entry.attrib for entry in root.iter()) - len(entries)
     if others:
         raise DatasetError(
-            f"{source}: {others} entries with a file are no DataSet right in a Collection: write them so"
+            f"{source}: {counted(others, 'entry with a file is', 'entries with a file are')} no DataSet right in a"
+            " Collection: write them so"
         )
     times = [time for time, _, _ in entries]
     if len(entries) > 1 and not np.isfinite(times).all():

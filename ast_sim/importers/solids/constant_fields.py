@@ -8,6 +8,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from ast_sim.importers.formats.source_mesh import SourceMesh
+from ast_sim.support.errors import counted
 
 # Names of cell fields by which programs say that an element is deleted, in small letters and without underlines.
 _OF_DELETED = ("status", "erosionstatus", "elementstatus", "deletionstatus", "death", "deleted", "eroded")
@@ -43,7 +44,9 @@ class ConstantFields:
                     if name in of_deleted
                     else "the values of the first frame are taken"
                 )
-                self.changes[name] = f"the field {name!r} changes in {changed.sum()} rows of {frame.path.name}: {taken}"
+                self.changes[name] = (
+                    f"the field {name!r} changes in {counted(changed.sum(), 'row')} of {frame.path.name}: {taken}"
+                )
 
     def notes(self) -> list[str]:
         """A note on each field that changes."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from ast_sim.importers.formats.source_mesh import SourceMesh
 from ast_sim.importers.solids.piece_order import rows_by_piece
-from ast_sim.support.errors import DatasetError
+from ast_sim.support.errors import DatasetError, counted
 
 # Names of fields by which programs number points, in small letters and without underlines.
 _NUMBERS = ("globalnodeid", "globalids", "globalid", "nodeid", "nodeids", "pointid", "pointids", "id", "ids")
@@ -79,7 +79,9 @@ def order_of_cells(frame: SourceMesh, first: SourceMesh) -> np.ndarray | None:
         DatasetError: the frame has other points or other cells; the text names it.
     """
     if len(frame.points) != len(first.points):
-        raise DatasetError(f"{frame.path}: has {len(frame.points)} points, {first.path.name} {len(first.points)}")
+        raise DatasetError(
+            f"{frame.path}: has {counted(len(frame.points), 'point')}, {first.path.name} {len(first.points):,}"
+        )
     if len(frame.blocks) == len(first.blocks) and all(
         a.kind == b.kind and np.array_equal(a.nodes, b.nodes) for a, b in zip(frame.blocks, first.blocks, strict=True)
     ):

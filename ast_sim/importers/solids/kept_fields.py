@@ -10,7 +10,7 @@ import numpy as np
 
 from ast_sim.importers.formats.source_mesh import SourceMesh
 from ast_sim.named_field import REACTION, NamedField
-from ast_sim.support.errors import ConfigError, DatasetError
+from ast_sim.support.errors import ConfigError, DatasetError, counted
 
 
 def parse_field(text: str) -> tuple[str, str]:
@@ -61,7 +61,7 @@ class KeptFields:
             kept = self.frames.setdefault(key, [])
             if kept and kept[0].shape[1] != values.shape[1]:
                 raise DatasetError(
-                    f"{frame.path}: the field {name!r} has {values.shape[1]} components, in the first frame"
+                    f"{frame.path}: the field {name!r} has {counted(values.shape[1], 'component')}, in the first frame"
                     f" {kept[0].shape[1]}: write it alike"
                 )
             kept.append(values if place == "node" or cells is None else values[cells])
@@ -100,6 +100,6 @@ class KeptFields:
                 raise DatasetError(f"{path}: the field {self.wanted[key]!r} is NaN at {place} {row}: leave it out")
             if lacking.any():
                 values[:, lacking] = 0
-                notes.append(f"{key} is NaN at {lacking.sum()} rows of obstacles: it is 0 there")
+                notes.append(f"{key} is NaN at {counted(lacking.sum(), 'row')} of obstacles: it is 0 there")
             fields[key] = NamedField(values.astype(np.float32), place, self.units[key])
         return fields, notes

@@ -16,7 +16,7 @@ import numpy as np
 from ast_sim.importers.formats.source_mesh import SourceMesh
 from ast_sim.importers.solids.middles import NO_NODE, TURNED, middles_of, require_near
 from ast_sim.importers.solids.splitting import tetrahedra_of, triangles_of
-from ast_sim.support.errors import DatasetError
+from ast_sim.support.errors import DatasetError, counted
 
 # A tetrahedron (triangle) is flat if its volume (area) is below this share of its longest edge to the power of 3 (2).
 _FLAT = 1e-6
@@ -78,13 +78,16 @@ def elements_of(mesh: SourceMesh, point_of: np.ndarray, corners: bool = False) -
         elif shape != "triangle":
             cut, owner = triangles_of(cells) if shape == "quad" else tetrahedra_of(shape, cells)
             kind = "triangles" if shape == "quad" else "tetrahedra"
-            told.append(f"{len(cells)} cells of the kind {shape} are cut into {len(cut)} {kind}")
+            are = counted(len(cells), f"cell of the kind {shape} is", f"cells of the kind {shape} are")
+            told.append(f"{are} cut into {len(cut):,} {kind}")
             cells, middle, row = cut, middle[owner], row[owner]
         nodes.append(cells)
         middles.append(middle)
         rows.append(row)
     said = [*_reduced(mesh, chosen, corners), *told]
-    said += [f"{twice} elements that stand in the file twice are taken once"] if twice else []
+    if twice:
+        are = counted(twice, "element that stands in the file twice is", "elements that stand in the file twice are")
+        said.append(f"{are} taken once")
     elements, middle, row = (np.concatenate(parts) for parts in (nodes, middles, rows))
     if dimension == 2:
         return Elements(elements, None, row, chosen, said)
@@ -104,7 +107,10 @@ def _reduced(mesh: SourceMesh, chosen: list[int], corners: bool) -> list[str]:
     for block in (mesh.blocks[index] for index in chosen):
         if block.is_curved and (corners or not block.has_middles):
             counts[block.label] += len(block.nodes)
-    return [f"{count} cells of the kind {kind} keep their corners only" for kind, count in counts.items()]
+    return [
+        f"{counted(count, f'cell of the kind {kind} keeps its', f'cells of the kind {kind} keep their')} corners only"
+        for kind, count in counts.items()
+    ]
 
 
 def _first_of_its_nodes(cells: np.ndarray) -> np.ndarray:
@@ -143,7 +149,7 @@ def require_extent(path: Path, points: np.ndarray, elements: np.ndarray) -> None
         row = int(np.argmax(flat))
         raise DatasetError(
             f"{path}: element {row} with the nodes {elements[row].tolist()} has no {kind}; {flat.sum()} of"
-            f" {len(flat)} elements have none: repair the mesh"
+            f" {counted(len(flat), 'element has', 'elements have')} none: repair the mesh"
         )
 
 
@@ -161,10 +167,15 @@ def _turned_over(
     plain = shape_of[rows] == "tetra"
     notes = []
     if (negative & plain).any():
-        notes.append(f"{(negative & plain).sum()} tetrahedra that were inside out are turned over")
+        are = counted(
+            (negative & plain).sum(), "tetrahedron that was inside out is", "tetrahedra that were inside out are"
+        )
+        notes.append(f"{are} turned over")
     cells, cell = np.unique(rows[~plain], return_inverse=True)
     if len(cells):
         turned = np.bincount(cell.ravel(), negative[~plain]) == np.bincount(cell.ravel())
         turned &= shape_of[cells] != "wedge"
-        notes += [f"{turned.sum()} cells that were inside out are turned over"] if turned.any() else []
+        if turned.any():
+            are = counted(turned.sum(), "cell that was inside out is", "cells that were inside out are")
+            notes.append(f"{are} turned over")
     return negative, notes

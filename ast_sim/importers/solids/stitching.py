@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 from ast_sim.importers.formats.source_mesh import SourceMesh
 from ast_sim.importers.solids.splitting import faces_of
 from ast_sim.number_arrays import connected_parts
-from ast_sim.support.errors import DatasetError
+from ast_sim.support.errors import DatasetError, counted
 
 # Points are at one place if they are nearer than this share of the size of the mesh.
 _SAME_PLACE = 1e-6
@@ -153,7 +153,7 @@ class Stitching:
         if not len(kept):
             return np.arange(size), []
         count = int(np.isin(label, label[kept]).sum())
-        return label, [f"{count} points at {places} places are joined: {_WHY[self.reason]}"]
+        return label, [f"{counted(count, 'point')} at {counted(places, 'place')} are joined: {_WHY[self.reason]}"]
 
     def _whole_parts(self) -> np.ndarray:
         """The pairs between parts that agree at all of them."""
@@ -177,8 +177,8 @@ class Stitching:
             at = self.mesh.points[self.pairs[np.argmax(rows), 0]].tolist()
             raise DatasetError(
                 f"{self.mesh.path}: each element has points of its own, and {what} differs at {rows.sum()} of"
-                f" {len(rows)} pairs of points at one place, the first at {at}: average the field at the points, or"
-                " leave it out"
+                f" {counted(len(rows), 'pair')} of points at one place, the first at {at}: average the field at the"
+                " points, or leave it out"
             )
 
 

@@ -16,7 +16,7 @@ from ast_sim.importers.solved_jobs.job_materials import MATERIAL_KEYWORDS, mater
 from ast_sim.importers.solved_jobs.job_temperatures import rows_of_target
 from ast_sim.number_arrays import connected_parts
 from ast_sim.scene import NodeType
-from ast_sim.support.errors import DatasetError
+from ast_sim.support.errors import DatasetError, counted
 
 # Directions 1 to 3 are displacements, 4 to 6 turns.
 _DIRECTIONS = 6
@@ -173,7 +173,10 @@ def _conditions(deck: Deck, mesh: SourceMesh) -> _Conditions:
             _rigid_body(keyword, state, mesh)
     partly = (state.sometimes & ~state.always)[:, :3].any(axis=1)
     if partly.any():
-        state.notes.append(f"{partly.sum()} nodes are prescribed in some steps only: they count as prescribed in all")
+        state.notes.append(
+            f"{counted(partly.sum(), 'node is', 'nodes are')} prescribed in some steps only: they count as prescribed"
+            " in all"
+        )
     return state
 
 
@@ -245,7 +248,8 @@ def _node_type(mesh: SourceMesh, conditions: _Conditions) -> np.ndarray:
     sliding = kept & held.any(axis=1) & ~prescribed
     if sliding.any():
         conditions_note = (
-            f"{sliding.sum()} nodes are held in some directions only (symmetry, sliding): they count as free"
+            f"{counted(sliding.sum(), 'node is', 'nodes are')} held in some directions only (symmetry, sliding): they"
+            " count as free"
         )
         mesh.notes.append(conditions_note)
     return types

@@ -12,6 +12,7 @@ from ast_sim.importers.decks.keyword_lines import Keyword, Line
 from ast_sim.importers.formats.source_mesh import SourceMesh
 from ast_sim.importers.solved_jobs.job_temperatures import node_temperatures
 from ast_sim.material import ELASTIC, YIELD_STRESS
+from ast_sim.support.errors import counted
 
 MATERIAL_KEYWORDS = (
     "MATERIAL",
@@ -123,7 +124,8 @@ def material_columns(deck: Deck, mesh: SourceMesh) -> tuple[dict[str, list[np.nd
             if keyword.name == "CHANGESOLIDSECTION":
                 one = _Material(one.name, other_law=True)
                 notes.append(
-                    f"line {keyword.line.number} changes the material of {len(numbers)} elements in a later step"
+                    f"line {keyword.line.number} changes the material of {counted(len(numbers), 'element')} in a later"
+                    " step"
                 )
             here = [np.isin(block.numbers, numbers) for block in blocks]
             for rows, table, at in zip(here, tables, temperatures, strict=True):
@@ -132,7 +134,10 @@ def material_columns(deck: Deck, mesh: SourceMesh) -> tuple[dict[str, list[np.nd
             notes += one.told(np.concatenate([at[rows] for at, rows in zip(temperatures, here, strict=True)]))
     lacking = sum(int(np.isnan(list(table.values())).any(axis=0).sum()) for table in tables)
     if lacking:
-        return {}, [*notes, f"{lacking} elements have no isotropic *ELASTIC: no material is taken"]
+        return {}, [
+            *notes,
+            f"{counted(lacking, 'element has', 'elements have')} no isotropic *ELASTIC: no material is taken",
+        ]
     plastic = any(table[YIELD_STRESS].any() for table in tables)
     used = COLUMNS if plastic else ELASTIC
     notes.append(f"the columns of the material are {', '.join(used)}")

@@ -14,7 +14,7 @@ from ast_sim.importers.solved_jobs.job import Job
 from ast_sim.importers.stress import order_of, von_mises
 from ast_sim.material import PRESSURES
 from ast_sim.scene import NodeType
-from ast_sim.support.errors import DatasetError, warn
+from ast_sim.support.errors import DatasetError, counted, warn
 
 # The coordinates of a deck and of its results may differ by this share of the size of the mesh; results have 6 digits.
 _AGREEMENT = 1e-4
@@ -81,7 +81,10 @@ def _with_adjusted(job: Job, frame: SourceMesh, mesh: SourceMesh) -> SourceMesh:
         return mesh
     points = mesh.points.copy()
     points[rows[moved]] = frame.points[there[moved]]
-    told = f"{moved.sum()} nodes stand where CalculiX has put them at rest ({', '.join(job.adjusting)})"
+    told = (
+        f"{counted(moved.sum(), 'node stands', 'nodes stand')} where CalculiX has put them at rest"
+        f" ({', '.join(job.adjusting)})"
+    )
     return replace(mesh, points=points, notes=[*mesh.notes, told])
 
 
@@ -135,7 +138,7 @@ def _require_whole(job: Job, path: Path, given: dict[str, np.ndarray]) -> None:
         values = given.get(name, np.zeros(len(job.mesh.points)))[nodes]
         lacking = np.isnan(values if values.ndim == 1 else values.sum(axis=1))
         if lacking.any():
-            raise DatasetError(f"{path}: {lacking.sum()} nodes have no {name}: write {how}")
+            raise DatasetError(f"{path}: {counted(lacking.sum(), 'node has', 'nodes have')} no {name}: write {how}")
 
 
 def _same_nodes(job: Job, frame: SourceMesh) -> tuple[np.ndarray, np.ndarray]:
@@ -152,9 +155,9 @@ def _same_nodes(job: Job, frame: SourceMesh) -> tuple[np.ndarray, np.ndarray]:
     counts = [sum(len(block.nodes) for block in mesh.blocks if block.dimension == 3) for mesh in (deck, frame)]
     if counts[1] > counts[0]:
         raise DatasetError(
-            f"{frame.path}: holds {counts[1]} elements of a volume, and {deck.path.name} {counts[0]}: it is of another"
-            " deck, or CalculiX has made solids of shells and beams; then write *NODE FILE, OUTPUT=2D and *EL FILE,"
-            " OUTPUT=2D"
+            f"{frame.path}: holds {counted(counts[1], 'element')} of a volume, and {deck.path.name} {counts[0]:,}: it"
+            " is of another deck, or CalculiX has made solids of shells and beams; then write *NODE FILE, OUTPUT=2D"
+            " and *EL FILE, OUTPUT=2D"
         )
     missing = np.setdiff1d(deck.same_point[used], numbers)
     if len(missing):
@@ -167,7 +170,7 @@ def _same_nodes(job: Job, frame: SourceMesh) -> tuple[np.ndarray, np.ndarray]:
             f"{other}: node {deck.same_point[rows[row]]} is off by {off:g} (CalculiX reads 20 characters of a number)"
         )
     if counts[0] != counts[1]:
-        raise DatasetError(f"{other}: it has {counts[1]} elements of a volume, the deck {counts[0]}")
+        raise DatasetError(f"{other}: it has {counted(counts[1], 'element')} of a volume, the deck {counts[0]:,}")
     return rows, there
 
 

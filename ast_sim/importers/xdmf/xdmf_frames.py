@@ -16,7 +16,7 @@ from ast_sim.importers.formats.source_mesh import SourceMesh, from_meshio
 from ast_sim.importers.meshio_files import by_meshio, what_meshio_says
 from ast_sim.importers.xdmf.xdmf_grids import with_one_grid, with_one_series
 from ast_sim.importers.xdmf.xdmf_items import made_of_others, with_joined_points, write_out
-from ast_sim.support.errors import DatasetError
+from ast_sim.support.errors import DatasetError, counted
 
 # How the coordinates of points may stand.
 _POINTS = ("XYZ", "XY", "X_Y_Z", "X_Y")
@@ -86,7 +86,7 @@ def _require_count(mesh: SourceMesh, topology: ET.Element | None) -> None:
     said = "" if topology is None else topology.get("NumberOfElements", topology.get("Dimensions", ""))
     cells = sum(len(block.nodes) for block in mesh.blocks)
     if said.isdigit() and int(said) != cells:
-        raise DatasetError(f"{mesh.path}: says that it holds {said} cells, but their array has {cells}")
+        raise DatasetError(f"{mesh.path}: says that it holds {counted(said, 'cell')}, but their array has {cells:,}")
 
 
 def _without_time(path: Path, tree: ET.ElementTree[Any]) -> tuple[float | None, bool]:
@@ -166,7 +166,9 @@ def _require_understood(path: Path, tree: ET.ElementTree[Any]) -> None:
     for grid in tree.iter("Grid"):
         for part in ("Geometry", "Topology"):
             if len(grid.findall(part)) > 1:
-                raise DatasetError(f"{path}: a grid has {len(grid.findall(part))} entries {part}; must have one")
+                raise DatasetError(
+                    f"{path}: a grid has {counted(len(grid.findall(part)), 'entry', 'entries')} {part}; must have one"
+                )
         if any(not one.get("Name") for one in grid.findall("Attribute")):
             raise DatasetError(f"{path}: a grid has a field (Attribute) without a Name: name it")
         fields = [(one.get("Name"), one.get("Center", "Node")) for one in grid.findall("Attribute")]

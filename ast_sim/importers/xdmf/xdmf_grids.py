@@ -10,7 +10,7 @@ from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
-from ast_sim.support.errors import DatasetError
+from ast_sim.support.errors import DatasetError, counted
 
 _POINTER = re.compile(r"xpointer\(/Xdmf/(.*)/([^/]*)\)")
 
@@ -28,7 +28,9 @@ def with_one_grid(path: Path, tree: ET.ElementTree[Any]) -> list[str]:
         return []
     points = [_points(path, tree, grid) for grid in grids]
     if any(one is not points[0] for one in points):
-        raise DatasetError(f"{path}: holds {len(grids)} grids with points of their own: write all bodies into one grid")
+        raise DatasetError(
+            f"{path}: holds {counted(len(grids), 'grid')} with points of their own: write all bodies into one grid"
+        )
     kept = max(grids, key=_rank)
     if kept.find("Geometry") is None:
         for include in [one for one in kept if one.tag.endswith("include")]:
@@ -37,8 +39,8 @@ def with_one_grid(path: Path, tree: ET.ElementTree[Any]) -> list[str]:
     others = [grid for grid in grids if grid is not kept]
     for grid in others:
         domain.remove(grid)
-    lost = [grid for grid in others if grid.find("Attribute") is not None or -1 < _rank(grid)[0] != _rank(kept)[0]]
-    named = [grid.get("Name", "without a name") for grid in lost]
+    left_out = [grid for grid in others if grid.find("Attribute") is not None or -1 < _rank(grid)[0] != _rank(kept)[0]]
+    named = [grid.get("Name", "without a name") for grid in left_out]
     return [f"grids on the same points are left out: {', '.join(named)}"] if named else []
 
 

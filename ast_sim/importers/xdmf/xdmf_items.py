@@ -17,7 +17,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from ast_sim.support.errors import DatasetError
+from ast_sim.support.errors import DatasetError, counted
 
 _JOIN = re.compile(r"\s*JOIN\s*\(\s*(\$\d+(?:\s*[,;]\s*\$\d+)*)\s*\)\s*", re.IGNORECASE)
 
@@ -89,8 +89,8 @@ def _values(path: Path, item: ET.Element) -> np.ndarray:
         return _plain(path, item, lambda array: array[()])
     else:
         raise DatasetError(
-            f"{path}: has numbers of the type {item.get('ItemType')} of {len(parts)} items; must be plain ones"
-            " (Uniform)"
+            f"{path}: has numbers of the type {item.get('ItemType')} of {counted(len(parts), 'item')}; must be plain"
+            " ones (Uniform)"
         )
     shape = _dimensions(item)
     if values.size != np.prod(shape):
@@ -131,8 +131,8 @@ def _slab(path: Path, numbers: np.ndarray, array: Any) -> np.ndarray:
     """A part of an array, by start, stride and count of each axis."""
     if numbers.size != 3 * len(array.shape):
         raise DatasetError(
-            f"{path}: a HyperSlab has {numbers.size} numbers for an array of the shape {tuple(array.shape)}; must be"
-            " start, stride and count of each axis"
+            f"{path}: a HyperSlab has {counted(numbers.size, 'number')} for an array of the shape {tuple(array.shape)};"
+            " must be start, stride and count of each axis"
         )
     start, stride, count = numbers.reshape(3, -1).astype(np.int64)
     last = start + (count - 1) * stride

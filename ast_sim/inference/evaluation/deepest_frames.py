@@ -27,7 +27,7 @@ from ast_sim.models.simulator import Simulator
 from ast_sim.number_arrays import measured_time, percent
 from ast_sim.scene import Trajectory
 from ast_sim.simulate.jobs.fastest_solver import UNMESHED, SolverOutcomes, cheapest, deepest_frame, solver_outcomes
-from ast_sim.support.errors import ConfigError, SimulationError
+from ast_sim.support.errors import ConfigError, SimulationError, counted
 
 
 def deepest_frames(
@@ -168,7 +168,7 @@ def lines(frames: DeepestFrames) -> list[str]:
         if beside is not None:
             told.append(
                 f"  {what}: {measured_time(beside.seconds)}, {beside.ratio:.3g} times as long (medians of"
-                f" {beside.scenes} scenes, one thread)"
+                f" {counted(beside.scenes, 'scene')}, one thread)"
             )
     return told + _unmeshed(frames.scenes)
 
@@ -182,8 +182,8 @@ def _unmeshed(scenes: Iterable[DeepestFrame]) -> list[str]:
     if not without:
         return []
     return [
-        f"  in {len(without)} of {len(solvers)} scenes the solver has no coarser mesh to begin on, also not for nested"
-        f" iteration: {without[0]}"
+        f"  in {len(without)} of {counted(len(solvers), 'scene')} the solver has no coarser mesh to begin on, also not"
+        f" for nested iteration: {without[0]}"
     ]
 
 

@@ -35,7 +35,7 @@ from ast_sim.named_field import STRESS, Output, require_fields
 from ast_sim.number_arrays import measured_time, percent
 from ast_sim.scene import Trajectory
 from ast_sim.simulate.jobs.recipe import recipe_of
-from ast_sim.support.errors import ConfigError, DatasetError
+from ast_sim.support.errors import ConfigError, DatasetError, counted
 
 ONE_STEP_NODES = 8192  # at most, of frames that are predicted together, unless a single one has more
 MEAN_TRAJECTORIES = 100  # training trajectories, at most, of whose stress `stress_constant` is the mean
@@ -61,7 +61,7 @@ def evaluate(
 
     Raises:
         DatasetError: the split has no frame to predict.
-        ConfigError: `made_from` is given, but the solver is not asked for, or the dataset was made of other things.
+        ConfigError: `made_from` is given, but the solver is not run, or the dataset was made of other things.
     """
     if made_from is not None:
         _require_origin(dataset, solver_scenes, made_from)
@@ -103,7 +103,7 @@ def evaluate(
 
 
 def _require_origin(dataset: Dataset, solver_scenes: int, made_from: str | os.PathLike[str]) -> None:
-    """Raise ConfigError if the solver is not asked for, or the dataset was made of other things, with which it would be
+    """Raise ConfigError if the solver is not run, or the dataset was made of other things, with which it would be
     left out in the end."""
     if not solver_scenes:
         raise ConfigError("made_from is for the solver: give solver_scenes, or leave it out")
@@ -228,8 +228,8 @@ def _all_frames(figures: Figures) -> str:
         _median([getattr(scene, f"{who}_seconds_per_step") for scene in known]) for who in ("model", "solver")
     )
     return (
-        f"a frame of all, in the median: the model {model} on {figures.threads} threads, the solver {solver} on one"
-        " thread when it made them"
+        f"a frame of all, in the median: the model {model} on {counted(figures.threads, 'thread')}, the solver {solver}"
+        " on one thread when it made them"
     )
 
 

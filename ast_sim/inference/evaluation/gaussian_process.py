@@ -28,7 +28,7 @@ from ast_sim.inference.quantities.relative_errors import judging_fields, moves, 
 from ast_sim.models.simulator import Simulator
 from ast_sim.scene import Scene, Trajectory
 from ast_sim.simulate.own_assembly.parameters import Values, values_of
-from ast_sim.support.errors import ConfigError, MissingExtra, require
+from ast_sim.support.errors import ConfigError, MissingExtra, counted, require
 from ast_sim.trade_figures import Setting, Side
 
 PROCESS = "Gaussian process"  # the name of its column
@@ -190,7 +190,7 @@ def _learned(
         raise ConfigError("nothing that describes a scene differs in the training scenes")
     shared = (quantity for quantity in known[0].sizes if all(quantity in one.sizes for one in (*known, *wanted)))
     quantities = [quantity for quantity in shared if one_mesh or quantity != "displacement"]
-    tell(f"a Gaussian process learns {', '.join(quantities)} of {len(known)} training scenes")
+    tell(f"a Gaussian process learns {', '.join(quantities)} of {counted(len(known), 'training scene')}")
     laws = {one: modal_process(x, np.stack([sample.sizes[one] for sample in known])) for one in quantities}
     errors: dict[str, list[float]] = {quantity: [] for quantity in quantities}
     seconds = []

@@ -177,8 +177,8 @@ class JumpingScene:
 
     def state(self, position: np.ndarray, fields: dict[str, Tensor], number: int) -> State:
         """The positions [N, 3] and fields of a frame, carried along to a later one."""
-        carried = torch.from_numpy(self.carry(position, self.question.prescribed_position[number]))
-        state = State(carried, stress=fields.get(STRESS))
+        position_then = torch.from_numpy(self.carry(position, self.question.prescribed_position[number]))
+        state = State(position_then, stress=fields.get(STRESS))
         if self.history is None:
             return state
         return replace(state, source=torch.tensor(position), history=self.graph.at_nodes(self.history, fields))

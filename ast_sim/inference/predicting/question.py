@@ -17,7 +17,7 @@ from ast_sim.models.model_config import ModelConfig
 from ast_sim.named_field import STRESS, NamedField
 from ast_sim.scene import Scene, Trajectory
 from ast_sim.support.argument_checks import in_short
-from ast_sim.support.errors import ConfigError, RolloutError
+from ast_sim.support.errors import ConfigError, RolloutError, counted
 from ast_sim.support.toml_settings import NOTHING
 
 WantedFrames = Iterable[int] | int | slice  # numbers of frames; negative ones count from the end
@@ -34,7 +34,7 @@ class Question:
             frames, of all nodes. Other entries are not read.
         fields: [frames, N or E, *] float32, the stress and named fields of at least the given frames, by name; missing
             ones are zero.
-        frames: the numbers of the frames that are wanted, in the order in which they are asked for; None: all of them,
+        frames: the numbers of the frames that are wanted, in the order in which the answer has them; None: all of them,
             the given ones too.
         movable: the scene may be moved into the domain of the model.
         notes: what is unusual about the scene for the model, as sentences.
@@ -72,7 +72,7 @@ class Question:
             raise RolloutError(f"{self.name} has the frames 0 to {count - 1}: name at least one frame")
         twice = next((number for number in wanted if wanted.count(number) > 1), None)
         if twice is not None:
-            raise ConfigError(f"{self.name}: frame {twice} is asked for twice: name each frame once")
+            raise ConfigError(f"{self.name}: frame {twice} is named twice: name each frame once")
         return replace(self, frames=wanted)
 
     def check(self, given: int) -> None:
@@ -80,7 +80,7 @@ class Question:
         self.scene.require_predictable(self.name)
         if len(self.prescribed_position) <= given:
             count = len(self.prescribed_position)
-            raise RolloutError(f"{self.name} has {count} frames; a rollout needs at least {given + 1}")
+            raise RolloutError(f"{self.name} has {counted(count, 'frame')}; a rollout needs at least {given + 1}")
 
     def wanted(self) -> tuple[int, ...]:
         """The numbers of the frames that are wanted."""

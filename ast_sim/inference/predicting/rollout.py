@@ -18,6 +18,7 @@ from ast_sim.inference.predicting.predicted_frames import PredictedFrame, Start,
 from ast_sim.inference.predicting.question import Question, not_finite, too_far
 from ast_sim.models.simulator import Simulator
 from ast_sim.named_field import STRESS
+from ast_sim.support.errors import counted
 from ast_sim.support.progress import Progress, ShowProgress
 
 
@@ -91,7 +92,7 @@ class _RollingScene:
         if failure is None:
             self.domain = self.model.domain(position)
             failure = too_far(self.config, self.question.name, frame, position) if self.domain is None else None
-        self.failure = failure and f"{failure}; the {frame} frames before it are kept"
+        self.failure = failure and f"{failure}; the {counted(frame, 'frame before it is', 'frames before it are')} kept"
 
     def answer(self) -> Answer:
         """The wanted frames so far as an answer."""

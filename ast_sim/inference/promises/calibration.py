@@ -27,7 +27,7 @@ from ast_sim.inference.quantities.band import LEVEL, Band
 from ast_sim.number_arrays import percent
 from ast_sim.runs.scope import LEEWAY, spacing_of
 from ast_sim.scene import Scene
-from ast_sim.support.errors import warn
+from ast_sim.support.errors import counted, warn
 
 if TYPE_CHECKING:
     from ast_sim.inference.answer import Answer
@@ -59,7 +59,7 @@ class Calibration:
     @property
     def text(self) -> str:
         """The bands and the kept errors in words."""
-        told = f"bands by {self.scenes} scenes: with {100 * LEVEL:g} % the errors of all frames lie within"
+        told = f"bands by {counted(self.scenes, 'scene')}: with {100 * LEVEL:g} % the errors of all frames lie within"
         for quantity, quantiles in self.quantiles.items():
             widths = zip(quantiles, self.efforts, strict=True)
             known = [f"{width:.3g} with {effort.text}" for width, effort in widths if math.isfinite(width)]

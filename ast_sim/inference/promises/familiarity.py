@@ -21,6 +21,8 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
+from ast_sim.support.errors import counted
+
 if TYPE_CHECKING:
     from ast_sim.inference.answer import Answer
 
@@ -80,7 +82,7 @@ class Familiarity:
         count = len(self.scores)
         larger = count + 1 - round(p_value * (count + 1))
         return (
-            f"the network finds the scene more unusual than {larger} of {count} calibration scenes (p ="
+            f"the network finds the scene more unusual than {larger} of {counted(count, 'calibration scene')} (p ="
             f" {p_value:.2g}): neither a band nor an error is promised",
         )
 

@@ -22,7 +22,7 @@ from ast_sim.number_arrays import percent
 from ast_sim.support.argument_checks import in_short
 from ast_sim.support.errors import ConfigError
 
-KEPT = 0.9  # of the scenes keep the error that was asked for
+KEPT = 0.9  # of the scenes keep the error that is promised
 DISPLACEMENT = "displacement"  # the quantity that every scene has; what an error is of, if nothing is said
 
 
@@ -66,10 +66,10 @@ class KeptErrors:
 
         Raises:
             ConfigError: no effort keeps them, which names the smallest that can be had; a quantity is not known; or
-                none is asked for.
+                none is given.
         """
         if not wanted:
-            raise ConfigError("no error is asked for: give one, such as 0.02 or {'reaction': 0.05}")
+            raise ConfigError("no error is given: give one, such as 0.02 or {'reaction': 0.05}")
         for quantity, error in wanted.items():
             self._require(quantity, error)
         wanted = {quantity: float(error) for quantity, error in wanted.items()}
@@ -88,7 +88,7 @@ class KeptErrors:
         )
 
     def _require(self, quantity: str, error: float) -> None:
-        """Raise ConfigError unless an error of this quantity can be asked for."""
+        """Raise ConfigError unless an error of this quantity can be kept."""
         if not self.errors:
             raise ConfigError(
                 "the run can promise no error: its calibration holds none; calibrate it again (a model that goes step"

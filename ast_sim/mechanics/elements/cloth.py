@@ -18,7 +18,7 @@ import numpy as np
 from scipy import sparse
 
 from ast_sim.mechanics.linear_algebra.sparsity import Entries
-from ast_sim.support.errors import SimulationError
+from ast_sim.support.errors import SimulationError, counted
 
 # The 45 entries (p, q), p <= q, of a triangle's symmetric 9 x 9 stiffness; p = 3 a + i for component i of node a.
 _ROW, _COLUMN = np.triu_indices(9)
@@ -268,7 +268,9 @@ def bending_matrix(rest: np.ndarray, triangles: np.ndarray) -> sparse.csr_matrix
     _, start, count = np.unique(key[order], return_index=True, return_counts=True)
     if (count > 2).any():
         one = order[start[np.argmax(count)]]
-        raise SimulationError(f"edge {tail[one]}-{head[one]} belongs to {count.max()} triangles: a sheet has at most 2")
+        raise SimulationError(
+            f"edge {tail[one]}-{head[one]} belongs to {counted(count.max(), 'triangle')}: a sheet has at most 2"
+        )
     left, right = order[start[count == 2]], order[start[count == 2] + 1]
     nodes = np.stack([tail[left], head[left], opposite[left], opposite[right]])  # [4, edges]
     x0, x1, x2, x3 = rest[nodes]

@@ -105,7 +105,7 @@ class Elasticity:
             project: replace the negative eigenvalues of d2 psi / dF2 by zero in each element.
 
         Raises:
-            numpy.linalg.LinAlgError: the eigenvalues of an element are lost in rounding (`stiffness`).
+            numpy.linalg.LinAlgError: the eigenvalues of an element are smaller than the rounding errors (`stiffness`).
         """
         J = deformation.J
         law = self.material
@@ -186,5 +186,5 @@ def stiffness(
     of_points = (np.broadcast_to(one, len(volume)) for one in (volume, mu, c, spread))
     arrays = map(np.ascontiguousarray, (F, gradients, *of_points))
     if not _C.elastic_stiffness(entries, *arrays, project):
-        raise np.linalg.LinAlgError("the stretch of an element is lost in rounding, or not finite")
+        raise np.linalg.LinAlgError("one stretch of an element is 7e7 times another, or not finite")
     return entries

@@ -43,8 +43,8 @@ class Results:
         reaction: [S,3] force in newton on the driven nodes.
         iterations: [S] iterations of each frame, also of repeated increments.
         cutbacks: [S] increments of each frame that were repeated with a shorter length.
-        nodal_forces: [S,N,3] newton, the forces from outside on each node; None: they were not asked for.
-        plastic_strain: [S,N,1] equivalent plastic strain, extrapolated to the nodes; None: it was not asked for.
+        nodal_forces: [S,N,3] newton, the forces from outside on each node; None: they were not requested.
+        plastic_strain: [S,N,1] equivalent plastic strain, extrapolated to the nodes; None: it was not requested.
     """
 
     displacement: np.ndarray

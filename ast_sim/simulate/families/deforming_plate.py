@@ -160,18 +160,18 @@ def _try_draw(rng: np.random.Generator, nodes: int, frames: int, order: int) -> 
     if plate is None:
         return None
     shape, obstacle, obstacle_elements = draw_obstacle(rng, cells, order)
-    way = draw_way(rng, frames)
+    progress = draw_progress(rng, frames)
     depth = rng.uniform(0.02, 0.065)
     direction = np.array([*rng.uniform(-0.25, 0.25, 2), -1.0])
     touch = _draw_touch(rng, plate, obstacle, depth * direction)
     if touch is None:
         return None
     gap = rng.uniform(0.004, 0.015)
-    drift = draw_drift(rng, way)
+    drift = draw_drift(rng, progress)
     lowest = obstacle[np.argmin(obstacle[:, 2])]
     start = np.array([*touch, plate.position[:, 2].max()]) - gap * direction
     obstacle = obstacle + start - lowest
-    travel = (depth + gap) * way[:, None] * direction + _follow(plate, touch, drift)
+    travel = (depth + gap) * progress[:, None] * direction + _follow(plate, touch, drift)
     attributes: dict[str, AttributeValue] = {
         "obstacle": shape,
         "outline": plate.shape.outline.kind,
@@ -270,7 +270,7 @@ def _draw_touch(rng: np.random.Generator, plate: _Plate, obstacle: np.ndarray, p
     return touch if solid and all(distance_to(hole, touch) >= plate.shape.spacing() / 2 for hole in holes) else None
 
 
-def draw_way(rng: np.random.Generator, frames: int) -> np.ndarray:
+def draw_progress(rng: np.random.Generator, frames: int) -> np.ndarray:
     """Share of the press in each frame [S].
 
     It rises from 0 to 1, stays there for some frames in some scenes, and falls back to 0; linearly or like a cosine.
@@ -278,17 +278,17 @@ def draw_way(rng: np.random.Generator, frames: int) -> np.ndarray:
     last = frames - 1
     peak = min(round(rng.triangular(0.7, 0.9, 0.93) * last), last - 1)
     hold = min(round(rng.uniform(0.02, 0.06) * last), peak - 1) if rng.random() < 0.3 else 0
-    way = np.interp(np.arange(frames), [0, peak - hold, peak, last], [0, 1, 1, 0])
-    return (1 - np.cos(np.pi * way)) / 2 if rng.random() < 0.5 else way
+    progress = np.interp(np.arange(frames), [0, peak - hold, peak, last], [0, 1, 1, 0])
+    return (1 - np.cos(np.pi * progress)) / 2 if rng.random() < 0.5 else progress
 
 
-def draw_drift(rng: np.random.Generator, way: np.ndarray) -> np.ndarray:
+def draw_drift(rng: np.random.Generator, progress: np.ndarray) -> np.ndarray:
     """Displacements [2,S,3] of the left and the right clamp in metres. None, one or both drift, by 0.02 to 0.06.
 
     They drift outwards, sideways, up and down, but not inwards, because a plate that is pushed together buckles. A
     drift grows smoothly until the last frame, or comes and goes with the press.
     """
-    drift = np.zeros((2, len(way), 3))
+    drift = np.zeros((2, len(progress), 3))
     moving = rng.choice(4, p=[0.5, 0.15, 0.15, 0.2])  # none, left, right, both
     for clamp, outwards in ((0, -1), (1, 1)):
         direction = np.array([outwards * rng.uniform(0, 0.7), *rng.uniform(-1, 1, 2)])
@@ -296,7 +296,7 @@ def draw_drift(rng: np.random.Generator, way: np.ndarray) -> np.ndarray:
         if moving in (clamp + 1, 3):
             drift[clamp] = size * direction / np.linalg.norm(direction)
     returns = rng.random() < 0.5
-    share = way if returns else (1 - np.cos(np.pi * np.linspace(0, 1, len(way)))) / 2
+    share = progress if returns else (1 - np.cos(np.pi * np.linspace(0, 1, len(progress)))) / 2
     return drift * share[:, None]
 
 

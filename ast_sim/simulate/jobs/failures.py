@@ -9,6 +9,7 @@ from ast_sim.dataset.reader import Dataset
 from ast_sim.simulate.jobs.samples import sample_name
 from ast_sim.simulate.own_assembly.parameters import Parameter, Values, told, values_of
 from ast_sim.simulate.own_assembly.spec_reader import read_spec
+from ast_sim.support.errors import counted
 
 MOST = 10  # scenes that are told one by one
 
@@ -28,7 +29,7 @@ def failures(dataset: Path, path: Path | None) -> Iterator[str]:
         yield f"{name} ({told(spec.parameters, values_of(one))}) stopped at {one.get('stopped_by', 'an unknown frame')}"
     values = [values_of(one) for one in stopped.values()]
     lie = "; ".join(_span(one, values) for one in spec.parameters.values() if one.is_drawn)
-    share = f"{len(stopped)} of {len(samples)} scenes stopped before their last frame"
+    share = f"{len(stopped)} of {counted(len(samples), 'scene')} stopped before their last frame"
     yield f"{share}, at {lie}" if lie else share
 
 

@@ -28,7 +28,7 @@ from ast_sim.simulate.jobs.display import SceneProgress
 from ast_sim.simulate.jobs.pool import Process
 from ast_sim.simulate.jobs.recipe import recipe_of
 from ast_sim.simulate.jobs.samples import sample_name
-from ast_sim.support.errors import ConfigError, SimulationError
+from ast_sim.support.errors import ConfigError, SimulationError, counted
 from ast_sim.support.progress import ShowProgress
 
 SOLVER_MODULE = "ast_sim.simulate.jobs.fastest_solver_worker"
@@ -68,7 +68,7 @@ class SolverVariant:
 
 _NESTED = tuple(
     SolverVariant(
-        f"{share} nodes, {solution}, {newton} Newton step{'s' * (newton > 1)}",
+        f"{share} nodes, {solution}, {counted(newton, 'Newton step')}",
         nodes=nodes,
         linearised=linearised,
         newton=newton,
@@ -256,7 +256,7 @@ def _frame(
 ) -> int:
     """The wanted frame of a trajectory, after a check; `which` is the place of its index among the indices."""
     if not callable(frame_of) and which >= len(frame_of):
-        raise ConfigError(f"{len(frame_of)} frames are too few: give one for each index")
+        raise ConfigError(f"{counted(len(frame_of), 'frame is', 'frames are')} too few: give one for each index")
     frame = frame_of(data.load(split, index)) if callable(frame_of) else frame_of[which]
     count = data.num_frames(split, index)
     if not 1 <= frame < count:

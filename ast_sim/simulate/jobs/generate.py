@@ -44,7 +44,7 @@ from ast_sim.simulate.jobs.samples import (
 from ast_sim.simulate.own_assembly.spec_reader import read_spec
 from ast_sim.support.argument_checks import file_name, require_bool
 from ast_sim.support.disk import output_file, replacing
-from ast_sim.support.errors import ConfigError, SimulationError
+from ast_sim.support.errors import ConfigError, SimulationError, counted
 from ast_sim.support.progress import ShowProgress, require_progress
 from ast_sim.support.toml_settings import require_range, required_whole, whole
 
@@ -181,8 +181,8 @@ def _make(
     if watch.failures:
         listing = "; ".join(f"{sample_name(*sample)}: {text}" for sample, text in list(watch.failures.items())[:3])
         raise SimulationError(
-            f"{len(watch.failures)} of {len(samples)} samples failed ({listing}). The others are kept in {folder}:"
-            " the same command goes on from there"
+            f"{len(watch.failures)} of {counted(len(samples), 'sample')} failed ({listing}). The others are kept in"
+            f" {folder}: the same command goes on from there"
         )
 
 
@@ -226,8 +226,8 @@ def _check_start(out: Path, made: Path, scenes: int, recipe: Recipe, module: Mod
     least, free = 16 * scenes * nodes * frames, shutil.disk_usage(folder).free
     if least > free:
         raise SimulationError(
-            f"{scenes:,} scenes need more than {least / 1e9:,.3f} GB, but {folder} has {free / 1e9:,.3f} GB:"
-            " make fewer or smaller scenes, or choose another disk"
+            f"{counted(scenes, 'scene needs', 'scenes need')} more than {least / 1e9:,.3f} GB, but {folder} has"
+            f" {free / 1e9:,.3f} GB: make fewer or smaller scenes, or choose another disk"
         )
 
 

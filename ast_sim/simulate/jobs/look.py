@@ -23,7 +23,7 @@ from ast_sim.simulate.own_assembly.assembly_spec import AssemblySpec
 from ast_sim.simulate.own_assembly.parameters import told, values_of
 from ast_sim.simulate.own_assembly.rest_check import gap_between
 from ast_sim.simulate.own_assembly.spec_reader import read_spec
-from ast_sim.support.errors import AstSimError, SimulationError
+from ast_sim.support.errors import AstSimError, SimulationError, counted
 
 SCENES = 4
 UNLOADED = 0.01  # a force below this share of the largest one is none
@@ -106,22 +106,22 @@ def outcome(spec: AssemblySpec, solved: Trajectory) -> str:
         return f"{peak}; {force[-1]:.3g} N act in the last frame: no permanent set before the parts are let go"
     yielding = [number for number, part in enumerate(spec.parts) if part.hardening]
     free = np.isin(solved.scene.body, yielding) & ~solved.scene.prescribed
-    way = np.linalg.norm(solved.position[:, free] - solved.position[0, free], axis=2).max(axis=1)
-    return f"{peak}, permanent set {way[-1]:.3g} {spec.unit} of {way.max():.3g} {spec.unit}"
+    travel = np.linalg.norm(solved.position[:, free] - solved.position[0, free], axis=2).max(axis=1)
+    return f"{peak}, permanent set {travel[-1]:.3g} {spec.unit} of {travel.max():.3g} {spec.unit}"
 
 
 def _lines(spec: AssemblySpec, case: SolidCase) -> Iterator[str]:
     """What a person should check: the nodes of each part, what stands still and what moves, the gaps."""
     scene, unit = case.scene, spec.unit
-    way = np.linalg.norm(case.followed()[0].prescribed_position - case.prescribed_position[0], axis=2).max(axis=0)
+    travel = np.linalg.norm(case.followed()[0].prescribed_position - case.prescribed_position[0], axis=2).max(axis=0)
     for number, part in enumerate(spec.parts):
         nodes = scene.body == number
         held = nodes & scene.prescribed
-        moved = held & (way > 0)
-        kind = "rigid" if part.rigid else f"{(nodes & (scene.node_type == NodeType.NORMAL)).sum()} free"
-        still = f", {(held & ~moved).sum()} stand still" if (held & ~moved).any() else ""
-        moves = f", {moved.sum()} move up to {way[moved].max():.4g} {unit}" if moved.any() else ""
-        yield f"{part.name}: {nodes.sum()} nodes ({kind}{still}{moves})"
+        moved = held & (travel > 0)
+        kind = "rigid" if part.rigid else f"{(nodes & (scene.node_type == NodeType.NORMAL)).sum():,} free"
+        still = f", {(held & ~moved).sum():,} stand still" if (held & ~moved).any() else ""
+        moves = f", {moved.sum():,} move up to {travel[moved].max():.4g} {unit}" if moved.any() else ""
+        yield f"{part.name}: {counted(nodes.sum(), 'node')} ({kind}{still}{moves})"
     for pair in combinations(range(len(spec.parts)), 2):
         names = " and ".join(spec.parts[number].name for number in pair)
         yield f"{names}: {gap_between(case, pair):.4g} {unit} apart"

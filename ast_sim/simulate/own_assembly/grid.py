@@ -15,7 +15,7 @@ import numpy as np
 from ast_sim.simulate.own_assembly.parameters import flattened
 from ast_sim.support.argument_checks import file_name, require_type
 from ast_sim.support.disk import read_text
-from ast_sim.support.errors import ConfigError
+from ast_sim.support.errors import ConfigError, counted
 
 MOST_ROWS = 100_000
 
@@ -58,7 +58,7 @@ def parse_setting(text: str) -> tuple[str, list[Any]]:
             " hook.file=long.step"
         ) from error
     if count > MOST_ROWS:
-        raise ConfigError(f"{text!r} asks for {count:,} values; at most {MOST_ROWS:,}: take fewer")
+        raise ConfigError(f"{text!r} asks for {counted(count, 'value')}; at most {MOST_ROWS:,}: take fewer")
     return name, np.linspace(first, last, count).tolist()
 
 
@@ -79,7 +79,7 @@ def grid(values: Mapping[str, Any]) -> list[dict[str, Any]]:
             raise ConfigError(f"{name} has no value")
     count = math.prod(len(v) for v in flat.values())
     if count > MOST_ROWS:
-        raise ConfigError(f"the grid has {count:,} rows; at most {MOST_ROWS:,}: take fewer values")
+        raise ConfigError(f"the grid has {counted(count, 'row')}; at most {MOST_ROWS:,}: take fewer values")
     return [dict(zip(flat, row, strict=True)) for row in product(*flat.values())]
 
 
@@ -102,9 +102,11 @@ def read_table(path: str | os.PathLike[str]) -> list[dict[str, Any]]:
         raise ConfigError(f"{path}: two columns have the name {twice!r}")
     for number, line in enumerate(lines[1:], 2):
         if len(line) != len(names):
-            raise ConfigError(f"{path}: row {number} has {len(line)} values, but there are {len(names)} names")
+            raise ConfigError(
+                f"{path}: row {number} has {counted(len(line), 'value')}, but there are {counted(len(names), 'name')}"
+            )
     if len(lines) - 1 > MOST_ROWS:
-        raise ConfigError(f"{path}: the table has {len(lines) - 1:,} rows; at most {MOST_ROWS:,}")
+        raise ConfigError(f"{path}: the table has {counted(len(lines) - 1, 'row')}; at most {MOST_ROWS:,}")
     return [{n: _number_or_text(v.strip()) for n, v in zip(names, line, strict=True)} for line in lines[1:]]
 
 

@@ -16,6 +16,7 @@ from ast_sim.mechanics.case import SolidCase
 from ast_sim.number_arrays import point
 from ast_sim.simulate.own_assembly.assembly_spec import AssemblySpec
 from ast_sim.simulate.own_assembly.rest_check import surface_of
+from ast_sim.support.errors import counted
 
 ENOUGH = 3  # elements across a wall that bends
 LARGEST_POISSON = 0.45
@@ -54,8 +55,8 @@ def limits(spec: AssemblySpec, case: SolidCase) -> Iterator[Limit]:
         ratio = float(poisson[elements].max())
         if ratio > LARGEST_POISSON:
             text = (
-                f"{part.name}: its {elements.sum()} linear elements lock at Poisson's ratio {ratio:.4g}, above"
-                f" {LARGEST_POISSON}, and its forces are too large: {CURE}"
+                f"{part.name}: its {counted(elements.sum(), 'linear element locks', 'linear elements lock')} at"
+                f" Poisson's ratio {ratio:.4g}, above {LARGEST_POISSON}, and its forces are too large: {CURE}"
             )
             yield Limit(part.name, "rubber", ratio, text)
         yield from _thin(spec, case, number)
@@ -77,8 +78,8 @@ def _thin(spec: AssemblySpec, case: SolidCase, number: int) -> Iterator[Limit]:
     where = point(middle[first] + np.asarray(case.attributes["origin"]))
     text = (
         f"{spec.parts[number].name}: fewer than {ENOUGH} linear elements lie across its wall at {len(few)} of"
-        f" {len(faces)} triangles of its surface, such as {where}, where it is {thickness[first]:.3g} {spec.unit}"
-        f" thick. If it bends there, it is several times too stiff: {CURE}, or choose a smaller size"
+        f" {counted(len(faces), 'triangle')} of its surface, such as {where}, where it is {thickness[first]:.3g}"
+        f" {spec.unit} thick. If it bends there, it is several times too stiff: {CURE}, or choose a smaller size"
     )
     yield Limit(spec.parts[number].name, "thin", len(few) / len(faces), text)
 

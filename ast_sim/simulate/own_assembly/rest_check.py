@@ -16,7 +16,7 @@ from ast_sim.plausibility.overlaps import deepest_node
 from ast_sim.simulate.own_assembly.assembly_spec import AssemblySpec
 from ast_sim.simulate.own_assembly.standing import Reference
 from ast_sim.simulate.shapes.parts import quarters
-from ast_sim.support.errors import SimulationError
+from ast_sim.support.errors import SimulationError, counted
 
 ON_A_LINE = 1e-3  # points lie on a line if their second extent, as a share of the first, is below this
 
@@ -55,7 +55,8 @@ def _check_held(spec: AssemblySpec, case: SolidCase) -> None:
         extents = np.linalg.svd(held - held.mean(axis=0), compute_uv=False)
         if len(held) < 3 or extents[1] <= ON_A_LINE * extents[0]:
             raise BadAssembly(
-                f"{part.name} is held at {len(held)} nodes that lie on a line, around which it could turn: hold more"
+                f"{part.name} is held at {counted(len(held), 'node')}, on one line, around which it could turn: hold"
+                " more"
             )
 
 
@@ -70,7 +71,7 @@ def _check_turned_over(spec: AssemblySpec, case: SolidCase) -> None:
             first = rows[np.argmax(wrong)]
             name = spec.parts[scene.body[first[0]]].name
             raise BadAssembly(
-                f"{name}: its prescribed nodes turn {wrong.sum()} elements over on the way to frame"
+                f"{name}: its prescribed nodes turn {counted(wrong.sum(), 'element')} over between rest and frame"
                 f" {np.searchsorted(stored, row)}, the first at"
                 f" {point(case.prescribed_position[0][first].mean(axis=0))}: make the motion smaller"
             )

@@ -87,7 +87,7 @@ class Table:
         return [Table(row, self.key(name) + f"[{i}]" * several, self.known) for i, row in enumerate(rows)]
 
     def done(self) -> None:
-        """Raise ConfigError if the table has a key that nobody asked for; the text names the nearest known one."""
+        """Raise ConfigError if the table has a key that was not read; the text names the nearest known one."""
         unknown = next((name for name in self.values if name not in self._read), None)
         if unknown is not None:
             raise ConfigError(f"there is no key {self.key(unknown)}{nearest_name(unknown, self._read)}")

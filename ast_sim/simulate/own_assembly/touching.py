@@ -58,12 +58,12 @@ def set_back(
         if _turned(cells, before, position):
             return [position for position, _ in bodies], []
     notes = []
-    way = np.linalg.norm(surfaces.position - start, axis=1)
+    moved = np.linalg.norm(surfaces.position - start, axis=1)
     for pair, nodes in moved.items():
         over = f", where facets overlap by up to {depth[pair]:.2g} {unit}" if depth[pair] > distance else ""
         notes.append(
             f"{' and '.join(names[number] for number in pair)} touch at rest{over}: surfaces are set back by up to"
-            f" {way[list(nodes)].max():.2g} {unit} there, so that contact begins at the contact distance {distance:g}"
+            f" {moved[list(nodes)].max():.2g} {unit} there, so that contact begins at the contact distance {distance:g}"
         )
     return after, notes
 
@@ -72,12 +72,12 @@ def _with_middles(before: np.ndarray, cells: np.ndarray, after: np.ndarray) -> n
     """The positions after, where nodes in the middles of edges inside of a part follow the ends of their edges."""
     if cells.shape[1] == 4:
         return after
-    way = after - before
+    moved = after - before
     middles, first = np.unique(cells[:, 4:], return_index=True)
     ends = cells[:, np.array(MIDDLES)].reshape(-1, 2)[first]
     inside = ~np.isin(middles, boundary(cells))
-    way[middles[inside]] = way[ends[inside]].mean(axis=1)
-    return before + way
+    moved[middles[inside]] = moved[ends[inside]].mean(axis=1)
+    return before + moved
 
 
 def _turned(cells: np.ndarray, before: np.ndarray, after: np.ndarray) -> bool:
@@ -109,14 +109,14 @@ def _way(surfaces: Surfaces, near: list[Near], wanted: float) -> np.ndarray:
         rigid = [surfaces.rigid[surfaces.body[nodes[0]]] for nodes, _, _ in sides]
         facing = normals[0] @ normals[1] < FACING
         between = _between(one, *normals)
-        for (nodes, triangle, normal), way, fixed, other in zip(
+        for (nodes, triangle, normal), towards, fixed, other in zip(
             sides, (between, -between), rigid, rigid[::-1], strict=True
         ):
             if fixed:
                 continue
             amount = missing if other else missing / 2
             for node in surfaces.faces[triangle].tolist() if facing else nodes:
-                constraints.setdefault(node, []).append(amount * (-normal if facing else way))
+                constraints.setdefault(node, []).append(amount * (-normal if facing else towards))
     result = np.zeros_like(surfaces.position)
     for node, rows in constraints.items():
         result[node] = _shortest(np.array(rows))
@@ -125,8 +125,8 @@ def _way(surfaces: Surfaces, near: list[Near], wanted: float) -> np.ndarray:
 
 def _between(near: Near, normal: np.ndarray, opposite: np.ndarray) -> np.ndarray:
     """[3]: the direction in which the first group leaves the other, of length one."""
-    way = opposite if len(near.other) == 3 else -normal if len(near.group) == 3 else opposite - normal
-    return way / max(np.linalg.norm(way), np.finfo(float).tiny)
+    towards = opposite if len(near.other) == 3 else -normal if len(near.group) == 3 else opposite - normal
+    return towards / max(np.linalg.norm(towards), np.finfo(float).tiny)
 
 
 def _shortest(rows: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ from ast_sim.mechanics.contact_and_friction import load_ipctk
 from ast_sim.number_arrays import connected_parts, point
 from ast_sim.simulate.shapes.cad.surface_mend import TriangleSurface, solids_of
 from ast_sim.simulate.shapes.parts import smallest_dihedral, volumes
-from ast_sim.support.errors import SimulationError
+from ast_sim.support.errors import SimulationError, counted
 
 SMALLEST_ANGLE = 5.0  # degrees between two faces of a tetrahedron
 SMALLEST_VOLUME = 1e-6  # smallest volume of a part, relative to the cube of its diagonal
@@ -139,8 +139,8 @@ def _check_points(position: np.ndarray, name: str, what: str) -> None:
     if len(pairs):
         a, b = pairs[np.lexsort(pairs.T[::-1])[0]]
         raise BadMesh(
-            f"{name}: {len(pairs)} pairs of {what} lie at one place, the first {a} and {b} at {point(position[a])}:"
-            " merge them"
+            f"{name}: {counted(len(pairs), f'pair of {what} lies', f'pairs of {what} lie')} at one place, the first {a}"
+            f" and {b} at {point(position[a])}: merge them"
         )
 
 
@@ -170,7 +170,7 @@ def _diagonal(position: np.ndarray) -> float:
 
 
 def _count(mask: np.ndarray, one: str, many: str) -> str:
-    return f"{mask.sum():,} {one if mask.sum() == 1 else many}"
+    return counted(int(mask.sum()), one, many)
 
 
 def _at(element: int, elements: np.ndarray, centre: np.ndarray) -> str:

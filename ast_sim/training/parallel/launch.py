@@ -20,7 +20,7 @@ import torch
 from ast_sim.dataset.reader import Dataset
 from ast_sim.runs.train_config import RunConfig
 from ast_sim.support.environment import of_child
-from ast_sim.support.errors import RESUME, ConfigError, TrainingError
+from ast_sim.support.errors import RESUME, ConfigError, TrainingError, counted
 from ast_sim.support.toml_settings import require_range
 
 LEAST_NODES = 3000  # of a process in a step; below, two processes are no faster than one (docs/log.md, 2026-11-27)
@@ -62,7 +62,10 @@ def usual_processes(config: RunConfig) -> int:
 def require_cut(config: RunConfig, processes: int) -> None:
     """Raise ConfigError unless each process can take an equal part of every batch."""
     if config.train.batch_size % processes:
-        raise ConfigError(f"train.batch_size = {config.train.batch_size} cannot be cut for {processes} processes")
+        raise ConfigError(
+            f"train.batch_size = {config.train.batch_size} cannot be cut for"
+            f" {counted(processes, 'process', 'processes')}"
+        )
 
 
 def _is_from_a_script(config: RunConfig) -> bool:

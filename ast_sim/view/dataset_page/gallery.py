@@ -15,6 +15,7 @@ import numpy as np
 
 from ast_sim.dataset.reader import Dataset
 from ast_sim.dataset.solver_seconds import SolverSeconds, read_seconds
+from ast_sim.support.errors import counted
 from ast_sim.support.progress import Progress, ShowProgress
 from ast_sim.view import page
 from ast_sim.view.dataset_page import survey
@@ -259,7 +260,7 @@ def _tiles(samples: Sequence[SampleFigures], checks: Sequence[Json], length_unit
     failed = [row["title"] for row in known if not row["passed"]]
     tiles = [
         {"label": "Complete", "value": f"{_floor_percent(complete, len(samples))}", "suffix": " %",
-         "detail": f"{complete:,} of {len(samples):,} sample{'s' if len(samples) != 1 else ''}"},
+         "detail": f"{complete:,} of {counted(len(samples), 'sample')}"},
         {"label": "Bounds kept", "value": f"{len(known) - len(failed)} of {len(known)}",
          "detail": f"broken: {', '.join(failed)}" if failed else f"{len(checks) - len(known)} not recorded"
          if len(known) < len(checks) else "by every sample"},

@@ -93,13 +93,13 @@ class SampleFigures:
         records = [self.numbers(key) for key in keys]
         if self.numbers("kinetic_energy") or {len(values) for values in records} != {self.frames}:
             return None
-        work, elastic, contact, lost = map(np.array, records)
+        work, elastic, contact, dissipated = map(np.array, records)
         stored = elastic + contact
-        largest = max(np.abs(energy).max() for energy in (work, stored, lost))
+        largest = max(np.abs(energy).max() for energy in (work, stored, dissipated))
         if not np.isfinite(largest):
             return math.nan
         loaded = np.abs(np.diff(work)) + np.abs(np.diff(stored)) > 1e-3 * largest
-        imbalance = np.abs(np.diff(work - stored - lost))[loaded]
+        imbalance = np.abs(np.diff(work - stored - dissipated))[loaded]
         return float(np.median(imbalance)) / largest if loaded.any() else 0.0
 
     @property

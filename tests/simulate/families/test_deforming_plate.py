@@ -21,7 +21,7 @@ from ast_sim.simulate.families.deforming_plate import (
     draw,
     draw_drift,
     draw_geometry,
-    draw_way,
+    draw_progress,
     solve,
 )
 from ast_sim.simulate.shapes.mesh_check import BadMesh
@@ -117,7 +117,7 @@ def test_the_same_plate_on_coarser_meshes():
             assert 0.7 * share <= len(plates[1]) / len(plates[0]) <= 1.5 * share
             np.testing.assert_allclose(np.ptp(plates[1], axis=0), np.ptp(plates[0], axis=0), rtol=0.06)
             obstacles = [c.prescribed_position[:, c.scene.body == 1] for c in (case, coarse)]
-            np.testing.assert_array_equal(obstacles[1], obstacles[0])  # it keeps its mesh and its way
+            np.testing.assert_array_equal(obstacles[1], obstacles[0])  # it keeps its mesh and its motion
             for end in (np.argmin, np.argmax):  # each clamp drifts as before
                 moves = [
                     c.prescribed_position[:, k] - c.prescribed_position[0, k]
@@ -202,21 +202,21 @@ def test_the_obstacle_comes_down_and_returns():
 def test_the_press_ends_late_and_is_let_go():
     held = linear = 0
     for index in range(40):
-        way = draw_way(np.random.default_rng(index), FRAMES)
-        assert len(way) == FRAMES and way[[0, -1]] == pytest.approx([0, 0]) and way.max() == 1
-        peak = int(np.argmax(way))
+        progress = draw_progress(np.random.default_rng(index), FRAMES)
+        assert len(progress) == FRAMES and progress[[0, -1]] == pytest.approx([0, 0]) and progress.max() == 1
+        peak = int(np.argmax(progress))
         assert 0.63 * FRAMES < peak < 0.94 * FRAMES
-        assert (np.diff(way[: peak + 1]) > 0).all() and (np.diff(way[peak:]) <= 0).all()
-        held += way[peak + 1] > way[peak] - 1e-12
-        linear += np.abs(np.diff(way[: peak - 1], n=2)).max() < 1e-12
+        assert (np.diff(progress[: peak + 1]) > 0).all() and (np.diff(progress[peak:]) <= 0).all()
+        held += progress[peak + 1] > progress[peak] - 1e-12
+        linear += np.abs(np.diff(progress[: peak - 1], n=2)).max() < 1e-12
     assert 4 <= held <= 20 and 10 <= linear <= 30
 
 
 @pytest.mark.parametrize("frames", [3, 5, 9])
 def test_few_frames_hold_press_and_release(frames):
     for index in range(40):
-        way = draw_way(np.random.default_rng(index), frames)
-        assert len(way) == frames and way[[0, -1]] == pytest.approx([0, 0]) and way.max() == 1
+        progress = draw_progress(np.random.default_rng(index), frames)
+        assert len(progress) == frames and progress[[0, -1]] == pytest.approx([0, 0]) and progress.max() == 1
     with pytest.raises(ConfigError, match="frames is 2; a press and its release need at least 3"):
         draw(np.random.default_rng(0), NODES, 2)
 
@@ -225,14 +225,14 @@ def test_clamps_drift_outwards_smoothly():
     count = np.zeros(4)
     for index in range(60):
         rng = np.random.default_rng(index)
-        way = draw_way(rng, FRAMES)
-        drift = draw_drift(rng, way)
+        progress = draw_progress(rng, FRAMES)
+        drift = draw_drift(rng, progress)
         largest = np.linalg.norm(drift, axis=2).max(axis=1)
         moving = largest > 0
         count[moving[0] + 2 * moving[1]] += 1
         assert ((largest[moving] > 0.0195) & (largest[moving] < 0.0601)).all() and (drift[:, 0] == 0).all()
         assert (drift[0, :, 0] <= 0).all() and (drift[1, :, 0] >= 0).all()
-        release = np.diff(way).min()
+        release = np.diff(progress).min()
         assert np.linalg.norm(np.diff(drift, axis=1), axis=2).max() <= 0.061 * max(-release, np.pi / 2 / (FRAMES - 1))
     assert (count > [15, 2, 2, 3]).all()
 

@@ -236,7 +236,7 @@ def test_frames_and_trajectories_that_are_not_there(plates):
     for frames in ([0], [9], lambda _: 9):
         with pytest.raises(ConfigError, match="train/000000 has no frame [09]: 1 to 8"):
             solver_outcomes(plates, "train", [0], frames)
-    with pytest.raises(ConfigError, match="1 frames are too few"):
+    with pytest.raises(ConfigError, match="1 frame is too few"):
         solver_outcomes(plates, "train", [0, 1], [3])
     with pytest.raises(DatasetError, match="no sample 2 in train"):
         solver_outcomes(plates, "train", [2])

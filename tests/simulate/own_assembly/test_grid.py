@@ -52,7 +52,7 @@ def test_tables(tmp_path):
     assert read_table(path) == [{"travel": 1.5, "hook.file": "a.step"}, {"travel": 2.0, "hook.file": "b.step"}]
     for text, line in (
         ("travel\n", "a row or more"),
-        ("a,b\n1,2\n3\n", "row 3 has 1 values, but there are 2 names"),
+        ("a,b\n1,2\n3\n", "row 3 has 1 value, but there are 2 names"),
         ("a, b,a\n1,2,3\n", "two columns have the name 'a'"),
     ):
         path.write_text(text)

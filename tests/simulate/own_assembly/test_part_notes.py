@@ -26,11 +26,11 @@ def write_odd(path, kind):
     elif kind == "hexahedra":
         corners = np.array([(x, y, z) for z in (0, 5) for x, y in ((0, 0), (10, 0), (10, 10), (0, 10))], float)
         position, cells = corners, [("hexahedron", np.arange(8)[None])]
-        told = "1 cells of the kind hexahedron are cut into"
+        told = "1 cell of the kind hexahedron is cut into"
     else:
         cells.append(("triangle", np.array([elements[0, :3]])))
         position = np.concatenate([position, [[5.0, 5, 9]]])
-        told = "1 cells of the kind triangle are left out; 1 points of no element are left out"
+        told = "1 cell of the kind triangle is left out; 1 point of no element is left out"
     meshio.Mesh(position, cells).write(path)
     return told
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from ast_sim.number_arrays import point
 from ast_sim.simulate.shapes.cad.surface_mend import TriangleSurface, several_solids
+from ast_sim.support.errors import counted
 
 MENDED = ("Degenerated", "SmallEdges", "SmallFaces")
 VTK_ORDER = [0, 1, 2, 3, 4, 5, 6, 7, 9, 8]  # of the nodes of a second-order tetrahedron, in gmsh's
@@ -100,8 +101,8 @@ def pick_solid(gmsh, solid: str | int | None) -> None:
     else:
         chosen = [i for i, name in enumerate(names) if f"/{solid}/".lower() in f"/{name}/".lower()]
     if len(chosen) != 1:
-        count = "no" if not chosen else f"{len(chosen)}"
-        raise BadPart(f"it holds {count} solid{'s' * (len(chosen) > 1)} {solid!r}; {told}")
+        held = counted(len(chosen), "solid") if chosen else "no solid"
+        raise BadPart(f"it holds {held} {solid!r}; {told}")
     others = [volume for i, volume in enumerate(volumes) if i != chosen[0]]
     gmsh.model.occ.remove(others, recursive=True)
     gmsh.model.occ.synchronize()
@@ -119,7 +120,10 @@ def _open_edge(gmsh, scale: float) -> str:
         return ""
     low, high = gmsh.model.getParametrizationBounds(1, single[0])
     where = [scale * x for x in gmsh.model.getValue(1, single[0], [(low[0] + high[0]) / 2])]
-    return f": its shell is open, {len(single)} edges bound only one face, the first at {point(where)}"
+    return (
+        f": its shell is open, {counted(len(single), 'edge bounds', 'edges bound')} only one face, the first at"
+        f" {point(where)}"
+    )
 
 
 def solid_of_surface(gmsh, surface: TriangleSurface, crease_angle: float = CREASE_ANGLE) -> None:

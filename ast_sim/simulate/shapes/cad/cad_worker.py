@@ -7,7 +7,7 @@ crashes and hangs on bad geometry and is under the GPL, so no other process of t
 A request: {"parts": [...], "nodes": wanted number of nodes of all parts, "seconds": limit on the processor time}. Each
 part is {"solid": steps of the grammar (see `grammar`)}, {"step": path} or {"stl": path}.
 The answer: position_i and elements_i of each part, scale_i (the length by which the coordinates of the file were
-divided), and the version of gmsh. Parts that keep their own scale are asked for under "own": see `own_scale`.
+divided), and the version of gmsh. Parts that keep their own scale stand under "own": see `own_scale`.
 """
 
 from __future__ import annotations

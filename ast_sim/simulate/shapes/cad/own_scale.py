@@ -41,6 +41,7 @@ from ast_sim.simulate.shapes.cad.cad_import import (
 )
 from ast_sim.simulate.shapes.cad.surface_mend import stl_surface
 from ast_sim.simulate.shapes.parts import smallest_dihedral
+from ast_sim.support.errors import counted
 
 MOST_NODES = 200_000  # of one part
 TRANSITION = 2.0  # length over which elements around a finer box grow to the usual size, in usual sizes
@@ -153,14 +154,14 @@ def _attempts(part: dict[str, Any]) -> Iterator[tuple[int, Attempt]]:
     """The attempts from "first" on, with their numbers, without attempts that differ in nothing that this part has."""
     known = set()
     for number, attempt in enumerate(ATTEMPTS):
-        way = (
+        settings = (
             attempt.factor,
             attempt.algorithm,
             attempt.mend if "step" in part else attempt.crease if "stl" in part else None,
         )
-        if number >= part.get("first", 0) and way not in known:
+        if number >= part.get("first", 0) and settings not in known:
             yield number, attempt
-        known.add(way)
+        known.add(settings)
 
 
 class BadElements(Exception):
@@ -183,10 +184,10 @@ def _without_slivers(gmsh) -> list[str]:
         sharp = int((angle < SMALLEST_ANGLE).sum())
         count = count or sharp
         if not sharp:
-            return [f"{count} sliver{'s' * (count > 1)} mended"] if count else []
+            return [f"{counted(count, 'sliver')} mended"] if count else []
         method = next(methods, None)
         if method is None:
-            raise BadElements(f"{sharp} elements with a dihedral angle of down to {angle.min():.2g} degrees")
+            raise BadElements(f"{counted(sharp, 'element')} with a dihedral angle of down to {angle.min():.2g} degrees")
         gmsh.model.mesh.optimize(method, force=True)
 
 

@@ -14,6 +14,7 @@ from scipy.spatial import KDTree
 from ast_sim.element_topology import equal_rows, triangle_sides
 from ast_sim.importers.formats.stl_file import BadSurface, StlFile, read_stl
 from ast_sim.number_arrays import connected_parts
+from ast_sim.support.errors import counted
 
 SAME_PLACE = 1e-7  # distance of corners that are one, relative to the diagonal
 CRACKS = (1e-6, 1e-5, 1e-4)  # the same where a surface is open otherwise
@@ -126,8 +127,8 @@ def _joined(corners: np.ndarray, tolerance: float) -> TriangleSurface:
     whole, needles = _without_needles(position, triangles[~points_alone])
     kept = _without_folds(whole)
     gone, folds = int(points_alone.sum()) + needles, len(whole) - len(kept)
-    notes = [f"{gone} triangle{'s' * (gone > 1)} of no area left out"] if gone else []
-    notes += [f"{folds} triangles that stand twice left out"] if folds else []
+    notes = [f"{counted(gone, 'triangle')} of no area left out"] if gone else []
+    notes += [f"{counted(folds, 'triangle that stands twice', 'triangles that stand twice')} left out"] if folds else []
     return TriangleSurface(position, kept, tuple(notes)).only(np.arange(len(kept)))
 
 
@@ -177,8 +178,8 @@ def _without_folds(triangles: np.ndarray) -> np.ndarray:
     which = which.ravel()
     start = triangles.argmin(axis=1)
     turned = np.take_along_axis(triangles, (start[:, None] + [1, 2]) % 3, axis=1)
-    way = np.where(turned[:, 0] < turned[:, 1], 1, -1)
-    balance = np.bincount(which, way)
+    sense = np.where(turned[:, 0] < turned[:, 1], 1, -1)
+    balance = np.bincount(which, sense)
     first = np.unique(which, return_index=True)[1]
     return triangles[np.sort(first[balance != 0])]
 
