@@ -267,7 +267,7 @@ def _add_predict(predict: Parser) -> None:
     about = "frames to predict: --frames=-1 for the last one, --frames 5,10,20 for some (default: all)"
     add_each(predict, {"--frames I,...": about}, type=whole_numbers)
     add_effort(predict)
-    about = "in place of the options of the effort: choose the most accurate effort within T milliseconds"
+    about = "in place of the same options: compute the most accurate answer that takes at most T milliseconds"
     add_each(predict, {"--ms T": about}, type=float)
     about = "number of frames of the motion (default: so that nodes move as far in a frame as in training)"
     add_each(predict, {"--num-frames N": about}, type=at_least(2))

@@ -31,9 +31,9 @@ def add_effort(parser: Parser, about: str | None = None) -> None:
     parser.add_argument("--exact", action="store_true", help=about or EXACT)
     parser.add_argument("--precision", choices=PRECISIONS, help=about or PRECISION)
     error = (
-        "in place of the options of the effort: choose the cheapest effort that keeps this error in 90 %% of scenes,"
-        " of the displacement (2%%) or of another quantity (reaction=5%%, stress=10%%); `calibrate` the run first; may"
-        " be repeated"
+        "in place of --corrections, --newton-steps and --exact: compute as little as keeps this error in 90 %% of"
+        " scenes: of the displacement (2%%) or of another quantity (reaction=5%%, stress=10%%); run `calibrate` first;"
+        " may be repeated"
     )
     place = "ast_sim.inference.promises.chosen_effort:parse_error"
     add_each(parser, {"--error E": error}, type=read_by(place), action="append", default=[])
