@@ -63,7 +63,7 @@ def main() -> None:
 
 def _answer(request: dict[str, Any]) -> tuple[dict[str, Any], list[np.ndarray]]:
     window = _silent_window()
-    pieces: list[np.ndarray] = []
+    pieces: list[dict[str, np.ndarray]] = []
     try:
         head, pieces = _read(Path(request["path"]), request["step"])
     except MemoryError:

@@ -86,7 +86,9 @@ def _require_count(mesh: SourceMesh, topology: ET.Element | None) -> None:
     said = "" if topology is None else topology.get("NumberOfElements", topology.get("Dimensions", ""))
     cells = sum(len(block.nodes) for block in mesh.blocks)
     if said.isdigit() and int(said) != cells:
-        raise DatasetError(f"{mesh.path}: says that it holds {counted(said, 'cell')}, but their array has {cells:,}")
+        raise DatasetError(
+            f"{mesh.path}: says that it holds {counted(int(said), 'cell')}, but their array has {cells:,}"
+        )
 
 
 def _without_time(path: Path, tree: ET.ElementTree[Any]) -> tuple[float | None, bool]:

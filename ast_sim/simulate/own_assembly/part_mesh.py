@@ -222,18 +222,18 @@ def _raised(mesh: PartMesh) -> PartMesh:
     ends = np.zeros((len(position) - len(mesh.position), 2), int)
     ends[cells[:, 4:] - len(mesh.position)] = cells[:, np.array(MIDDLES)]
 
-    def transferred(values: np.ndarray) -> np.ndarray:
+    def of_nodes(values: np.ndarray) -> np.ndarray:
         first, second = values[ends].T
         return np.concatenate([values, np.where((first != 0) & (second != 0), first, 0)])
 
     inside = {name: np.isin(np.arange(len(mesh.position)), nodes) for name, nodes in mesh.groups.items()}
-    groups = {name: np.flatnonzero(transferred(nodes)) for name, nodes in inside.items()}
+    groups = {name: np.flatnonzero(of_nodes(nodes)) for name, nodes in inside.items()}
     return PartMesh(
         mesh.name,
         position,
         cells,
         groups,
-        {name: transferred(values) for name, values in mesh.fields.items()},
+        {name: of_nodes(values) for name, values in mesh.fields.items()},
         mesh.notes,
     )
 

@@ -58,12 +58,13 @@ def set_back(
         if _turned(cells, before, position):
             return [position for position, _ in bodies], []
     notes = []
-    moved = np.linalg.norm(surfaces.position - start, axis=1)
+    set_back = np.linalg.norm(surfaces.position - start, axis=1)
     for pair, nodes in moved.items():
         over = f", where facets overlap by up to {depth[pair]:.2g} {unit}" if depth[pair] > distance else ""
         notes.append(
             f"{' and '.join(names[number] for number in pair)} touch at rest{over}: surfaces are set back by up to"
-            f" {moved[list(nodes)].max():.2g} {unit} there, so that contact begins at the contact distance {distance:g}"
+            f" {set_back[list(nodes)].max():.2g} {unit} there, so that contact begins at the contact distance"
+            f" {distance:g}"
         )
     return after, notes
 

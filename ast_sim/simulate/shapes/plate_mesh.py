@@ -56,10 +56,10 @@ def area(loop: np.ndarray) -> float:
 
 def resample(curve: np.ndarray, spacing: float, least: int = 1) -> np.ndarray:
     """Points [n,2] on a polyline at equal steps near `spacing`, at least `least` of them; the end is left out."""
-    length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
-    n = max(least, round(length[-1] / spacing))
-    at = np.arange(n) * (length[-1] / n)
-    return np.stack([np.interp(at, length, component) for component in curve.T], axis=1)
+    arc = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
+    n = max(least, round(arc[-1] / spacing))
+    at = np.arange(n) * (arc[-1] / n)
+    return np.stack([np.interp(at, arc, component) for component in curve.T], axis=1)
 
 
 def inside(points: np.ndarray, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
