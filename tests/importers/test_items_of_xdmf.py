@@ -132,7 +132,7 @@ WRONG = {
         made("HyperSlab", item(np.array([0, 0, 1, 1, 4, 3])) + item(MOVED[1])),
         f"have the Dimensions {COUNT} 3, but 12 are chosen",
     ),
-    "nothing chosen from": (made("HyperSlab", item(np.array([0, 0, 1, 1, 4, 3]))), "HyperSlab of 1 items"),
+    "nothing chosen from": (made("HyperSlab", item(np.array([0, 0, 1, 1, 4, 3]))), "HyperSlab of 1 item"),
     "an index too many": (
         made("Coordinates", item(np.full(6 * COUNT, COUNT)) + item(MOVED[1])),
         "Coordinates must be, for each number, an index for each axis",
@@ -153,7 +153,7 @@ WRONG = {
         made("Function", 3 * item(MOVED[1][:, 0]), facts='Function="JOIN($0, $1, $3)"'),
         r"by the function 'JOIN\(\$0, \$1, \$3\)'",
     ),
-    "a tree": (made("Tree", item(MOVED[1])), "numbers of the type Tree of 1 items; must be plain ones"),
+    "a tree": (made("Tree", item(MOVED[1])), "numbers of the type Tree of 1 item; must be plain ones"),
     "a file that is missing": (
         made("HyperSlab", item(np.array([0, 0, 1, 1, COUNT, 3])) + hdf("u", MOVED[1])),
         "the numbers 'all.h5:/u' cannot be read",
