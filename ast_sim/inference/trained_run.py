@@ -106,8 +106,9 @@ class Run:
 
     @property
     def info(self) -> DatasetInfo:
-        """The units and the kind of the predictions."""
+        """The units and the kind of the predictions, and the names of their material."""
         model, scope = self.settings.model, self.scope
+        names = {"material": list(model.data.columns)} if model.data.columns else {}
         return DatasetInfo(
             family=scope.family,
             integration=model.data.integration,
@@ -117,7 +118,7 @@ class Run:
             contact_radius=model.data.contact_radius,
             time_step=scope.time_step,
             length_unit=scope.length_unit,
-            generator={"program": "ast_sim predict"},
+            generator={"program": "ast_sim predict", **names},
         )
 
     def predict(

@@ -54,6 +54,22 @@ def test_own_data_have_a_reaction_in_any_order_of_the_columns(tmp_path):
     assert exact.converged and np.isfinite(exact.reaction()).all()
 
 
+@pytest.mark.parametrize("names", [["young", "poisson"], ["thickness", "density"], None])
+def test_a_saved_answer_keeps_the_names_so_its_run_takes_it(tmp_path, names):
+    run, answer = trained(tmp_path, names, NUMBERS)
+    answer.save(tmp_path / "answer.h5")
+    columns = tuple(names or ("column 0", "column 1"))
+    with Dataset(tmp_path / "answer.h5") as saved:
+        assert saved.material.columns == run.info.material(2).columns == answer.info.material(2).columns == columns
+    assert run.evaluate(tmp_path / "answer.h5", solver_scenes=0).figures.error("displacement").rmse_sequence == 0
+
+
+def test_runs_that_come_with_the_package_know_the_names():
+    states = ("yield_stress", "yield_stress_2", "plastic_strain_2", "yield_stress_3", "plastic_strain_3")
+    assert example_run("clip").info.material(7).columns == ("young", "poisson", *states)
+    assert "material" not in example_run("plates").info.generator
+
+
 def test_plates_have_the_reaction_of_the_solver(tmp_path, monkeypatch):
     """Their constants are recorded, and are no columns."""
     generate("deforming_plate", tmp_path / "d.h5", train=1, nodes=150, frames=3, workers=1, progress=False)
