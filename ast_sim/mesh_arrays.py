@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from enum import IntEnum
-from itertools import combinations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,10 +16,11 @@ from ast_sim.number_arrays import (
     real_numbers,
     require_array,
     require_nodes,
+    rounding,
     whole_numbers,
 )
 from ast_sim.support.argument_checks import in_short, require_line, several
-from ast_sim.support.errors import ConfigError, DatasetError
+from ast_sim.support.errors import ConfigError, DatasetError, warn
 
 if TYPE_CHECKING:
     import meshio
@@ -47,13 +47,16 @@ def scene_arrays(
     """The arrays of a scene by name; arguments and errors are as in `Scene.of`."""
     require_line("name", name)
     position = real_numbers(name, "points", points)
+    exact = np.asarray(points)
     if position.ndim == 2 and position.shape[1] == 2:
-        position = np.pad(position, ((0, 0), (0, 1)))
+        position, exact = (np.pad(rows, ((0, 0), (0, 1))) for rows in (position, exact))
     require_array(name, "points", position, np.float32, (None, 3))
     count = len(position)
     elements = whole_numbers(name, "cells", cells, np.int32)
     require_array(name, "cells", elements, np.int32, (None, None))
     require_nodes(name, "cell", elements, count)
+    for doubt in rounding(exact, position, elements):
+        warn(f"{name}: {doubt}")
     parts = connected_parts(elements, count) if body is None else whole_numbers(name, "body", body, np.int32)
     require_array(name, "body", parts, np.int32, (count,))
     types = whole_numbers(name, "node_type", np.zeros(count) if node_type is None else node_type, np.uint8)
@@ -143,21 +146,3 @@ def mesh_of_arrays(
         point_data={"node_type": node_type.copy(), "body": body.copy()},
         cell_data={} if material is None else {"material": [material.copy()]},
     )
-
-
-def require_mesh(name: str, elements: np.ndarray, node_type: np.ndarray, body: np.ndarray) -> None:
-    """Raise DatasetError if an element refers to a node twice, if the type of a node is no `NodeType`, or if a body has
-    a number below 0; the text names `name` and the first one."""
-    pairs = combinations(range(elements.shape[1]), 2)
-    repeated = np.logical_or.reduce([elements[:, a] == elements[:, b] for a, b in pairs])
-    if repeated.any():
-        row = int(np.argmax(repeated))
-        raise DatasetError(f"{name}: element {row} refers to a node twice: {elements[row].tolist()}")
-    unknown = np.logical_and.reduce([node_type != kind for kind in NodeType])
-    if unknown.any():
-        node = int(np.argmax(unknown))
-        known = ", ".join(f"{kind.value} {kind.name}" for kind in NodeType)
-        raise DatasetError(f"{name}: node {node} has the type {node_type[node]}; known are {known}")
-    if (body < 0).any():
-        node = int(np.argmax(body < 0))
-        raise DatasetError(f"{name}: node {node} is of the body {body[node]}, but bodies are numbered from 0")

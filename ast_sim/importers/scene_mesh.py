@@ -11,8 +11,8 @@ import numpy as np
 
 from ast_sim.importers.mesh_file import MeshFile, read_mesh
 from ast_sim.importers.places import Place, parse_places
-from ast_sim.importers.solids.mesh_elements import require_extent
-from ast_sim.number_arrays import nodes_of_body, real_numbers
+from ast_sim.mesh_rules import require_extent
+from ast_sim.number_arrays import nodes_of_body, real_numbers, rounding
 from ast_sim.plausibility.topology import at_rest
 from ast_sim.scene import NodeType, Scene
 from ast_sim.support.argument_checks import file_name, in_short, require_bool, require_type, several
@@ -23,9 +23,6 @@ if TYPE_CHECKING:
 
 # Nodes lie on a line if their second extent, as a share of the first, is below this.
 _ON_A_LINE = 1e-3
-
-# Rounding to float32 may move points by this share of the shortest edge before a warning is given.
-_ROUNDING = 0.01
 
 Numbers = float | Sequence[float]
 
@@ -88,7 +85,7 @@ def read_scene(
     mesh = read_mesh(source, used_fields=used_fields, corners=corners)
     scene, used = mesh.scene(body_field, type_field)
     scene.check(str(mesh.path))
-    require_extent(mesh.path, mesh.points[used], scene.elements)
+    require_extent(str(mesh.path), mesh.points[used], scene.elements)
     types, doubts = _node_type(mesh, scene, used, obstacles, clamps)
     scene = replace(scene, node_type=types)
     scene = replace(scene, material=_material(mesh, scene, materials, material_fields))
@@ -98,21 +95,8 @@ def read_scene(
             " clamps=['BODY:PLACE'] (--clamp BODY:PLACE), for example 0:xmin"
         )
     scene.check(str(mesh.path))
-    looks_wrong = [str(finding) for finding in at_rest(scene)]
-    return SceneMesh(scene, [*mesh.notes], [*doubts, *_rounded(mesh, scene, used), *looks_wrong])
-
-
-def _rounded(mesh: MeshFile, scene: Scene, used: np.ndarray) -> list[str]:
-    """A warning if points far from the origin lie elsewhere as float32, by a share of an edge."""
-    off = float(np.abs(scene.rest_position - mesh.points[used]).max())
-    shortest = min(_shortest_edge(scene, int(body)) for body in np.unique(scene.body))
-    if off <= _ROUNDING * shortest:
-        return []
-    farthest = float(np.abs(scene.rest_position).max())
-    return [
-        f"rounding to float32 moves points by up to {off:.3g}, and the shortest edge is {shortest:.3g}: the mesh is too"
-        f" fine for coordinates of up to {farthest:.3g}; move it to the origin"
-    ]
+    doubts += rounding(mesh.points[used], scene.rest_position, scene.elements)
+    return SceneMesh(scene, [*mesh.notes], [*doubts, *map(str, at_rest(scene))])
 
 
 def describe(scene: Scene) -> list[str]:

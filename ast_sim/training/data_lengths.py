@@ -13,10 +13,12 @@ from ast_sim.dataset.reader import Dataset
 from ast_sim.inference.evaluation.measures import SquaredError, rmse_pooled
 from ast_sim.models.data_facts import DataFacts
 from ast_sim.models.model_config import ModelConfig
+from ast_sim.plausibility.findings import Finding, refusal
+from ast_sim.plausibility.topology import folded_inside_out
 from ast_sim.prescribed_motion import Motion
 from ast_sim.runs.scope import Scope, edge_lengths, held_share_of, size_of, spacing_of
 from ast_sim.scene import AttributeValue, NodeType
-from ast_sim.support.errors import TrainingError
+from ast_sim.support.errors import TrainingError, warn
 
 # Facts of the data (`DataFacts`), and the attributes of trajectories that hold them.
 RECORDED = {"young": "young", "poisson": "poisson", "contact_range": "dhat", "friction": "friction"}
@@ -62,9 +64,11 @@ def measure(dataset: Dataset) -> DataScales:
     displacement, increment, lengths, nodes, constants, planar = [], [], [], [], [], True
     center = np.array(dataset.info.domain_center)
     room = math.inf
+    folded: list[tuple[str, Finding]] = []
     for name, trajectory in dataset.spread("train", MEASURED):
         scene, position = trajectory.scene, trajectory.position
         scene.require_predictable(name)
+        folded += [(name, finding) for finding in folded_inside_out(scene)]
         normal = scene.node_type == NodeType.NORMAL
         displacement.append(SquaredError.between(position, scene.rest_position, normal))
         increment.append(SquaredError.between(position[1:], position[:-1], normal))
@@ -73,6 +77,8 @@ def measure(dataset: Dataset) -> DataScales:
         constants.append({key: trajectory.attributes.get(name) for key, name in RECORDED.items()})
         room = min(room, dataset.info.domain_half_width - float(np.abs(position - center).max()))
         planar = planar and not scene.rest_position[:, 2].any() and not position[:, :, 2].any()
+    if folded:
+        warn(refusal(folded))
     return DataScales(
         displacement=rmse_pooled(displacement),
         increment=rmse_pooled(increment),
