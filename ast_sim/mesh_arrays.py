@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ast_sim.element_topology import CELL_KINDS
+from ast_sim.material import Material
 from ast_sim.number_arrays import (
     connected_parts,
     nodes_of_body,
@@ -65,6 +66,11 @@ def scene_arrays(
         types[_nodes(name, handles, count)] = NodeType.HANDLE
     for number in several("obstacles", obstacles, "the numbers of bodies, such as [1]"):
         types[nodes_of_body(parts, number)] = NodeType.OBSTACLE
+    if isinstance(material, Material | Mapping):
+        raise ConfigError(
+            f"material is {in_short(material)}; it must be numbers, [E, m] or [m], such as (2e5, 0.3): their names"
+            " belong to a dataset (DatasetInfo.generator) or a run"
+        )
     columns = None if material is None else real_numbers(name, "material", material)
     if columns is not None and columns.ndim == 1:
         columns = np.tile(columns, (len(elements), 1))

@@ -11,6 +11,7 @@ import numpy as np
 
 from ast_sim.importers.mesh_file import MeshFile, read_mesh
 from ast_sim.importers.places import Place, parse_places
+from ast_sim.material import Material
 from ast_sim.mesh_rules import require_extent
 from ast_sim.number_arrays import nodes_of_body, real_numbers, rounding
 from ast_sim.plausibility.topology import at_rest
@@ -208,13 +209,21 @@ def _material(
 ) -> np.ndarray | None:
     """[E, m] float32; None if no material is given."""
     if materials is None:
-        return mesh.columns(fields)
+        columns = mesh.columns(fields)
+        Material(tuple(fields)).require_possible(str(mesh.path), columns, ~scene.rigid_elements)
+        return columns
     if fields:
         raise ConfigError("the material is given twice: by body and by cell fields; leave one out")
     bodies = [int(body) for body in np.unique(scene.body)]
     rigid = scene.rigid_bodies
     deforming = [body for body in bodies if body not in rigid]
     given = materials if isinstance(materials, Mapping) else dict.fromkeys(deforming, materials)
+    for body, one in given.items():
+        if isinstance(one, Mapping):
+            raise ConfigError(
+                f"the material of body {body} is {in_short(one)}; it must be a number or numbers, in the order of the"
+                " columns of the training, such as (2e5, 0.3)"
+            )
     numbers = {body: real_numbers(str(mesh.path), "materials", one) for body, one in given.items()}
     rows = {body: np.atleast_1d(one) for body, one in numbers.items()}
     for body in rows:

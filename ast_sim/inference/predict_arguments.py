@@ -182,10 +182,13 @@ def _given_stress(config: ModelConfig, scene: Scene, stress: np.ndarray | None, 
 
 
 def _require_material(config: ModelConfig, scope: Scope, scene: Scene, name: str) -> None:
-    """Raise ConfigError unless the scene has as many material columns as the training scenes."""
+    """Raise ConfigError unless the scene has as many material columns as the training scenes, or DatasetError if they
+    hold what no material has."""
     wanted = config.data.material_width
     given = 0 if scene.material is None else scene.material.shape[1]
     if given == wanted:
+        if given:
+            config.data.material.require_possible(name, scene.material, ~scene.rigid_elements)
         return
     if not wanted:
         raise ConfigError(

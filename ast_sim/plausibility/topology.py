@@ -62,7 +62,7 @@ def _inside_out(scene: Scene) -> list[Finding]:
 
 
 def no_scene(scene: Scene) -> list[Finding]:
-    """What no bodies of tetrahedra can be at rest: inside each other, or folded over so that elements are inside out."""
+    """What no bodies of tetrahedra can be at rest: inside each other, or folded so that elements are inside out."""
     return [] if scene.elements.shape[1] == 3 else [*folded_inside_out(scene), *overlaps(scene)]
 
 
