@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from ast_sim.number_arrays import plain_array
 from ast_sim.support.argument_checks import in_short, require_line, require_type, several
 from ast_sim.support.errors import ConfigError, DatasetError
 
@@ -140,7 +139,7 @@ class Material:
             ConfigError: there is neither; or `values` has other columns.
         """
         if values is not None:
-            values = plain_array("the material", "values", values)
+            values = np.asarray(values)
             if values.ndim != 2 or values.dtype.kind not in "fiu":
                 raise ConfigError(
                     f"the values of a material are {in_short(values)}; they must be numbers [elements, columns]"

@@ -62,10 +62,13 @@ def scene_arrays(
     require_array(name, "body", parts, np.int32, (count,))
     types = whole_numbers(name, "node_type", np.zeros(count) if node_type is None else node_type, np.uint8)
     require_array(name, "node_type", types, np.uint8, (count,))
-    if handles is not None:
-        types[_nodes(name, handles, count)] = NodeType.HANDLE
     for number in several("obstacles", obstacles, "the numbers of bodies, such as [1]"):
         types[nodes_of_body(parts, number)] = NodeType.OBSTACLE
+    if handles is not None:
+        nodes = _nodes(name, handles, count)
+        for doubt in of_obstacles("handles", nodes, types, parts):
+            warn(f"{name}: {doubt}")
+        types[nodes[types[nodes] != NodeType.OBSTACLE]] = NodeType.HANDLE
     if isinstance(material, Material | Mapping):
         raise ConfigError(
             f"material is {in_short(material)}; it must be numbers, [E, m] or [m], such as (2e5, 0.3): their names"
@@ -75,6 +78,17 @@ def scene_arrays(
     if columns is not None and columns.ndim == 1:
         columns = np.tile(columns, (len(elements), 1))
     return {"rest_position": position, "elements": elements, "node_type": types, "body": parts, "material": columns}
+
+
+def of_obstacles(what: str, nodes: np.ndarray, types: np.ndarray, body: np.ndarray) -> list[str]:
+    """One sentence if some of the nodes, which `what` would make handles, are obstacles, which they stay."""
+    rigid = nodes[types[nodes] == NodeType.OBSTACLE]
+    if not len(rigid):
+        return []
+    return [
+        f"{what}: {len(rigid)} of {len(nodes)} nodes stay obstacles, the first is node {rigid[0]} of body"
+        f" {body[rigid[0]]}: an obstacle moves as a whole"
+    ]
 
 
 def _nodes(name: str, handles: Any, count: int) -> np.ndarray:
@@ -95,12 +109,14 @@ def joined_arrays(given: Sequence[Any]) -> dict[str, Any]:
     for scene in given:
         if not hasattr(scene, "rest_position"):
             raise ConfigError(f"a scene to join is {in_short(scene)}; it must be a Scene")
+    if not given:
+        raise ConfigError("there is no scene to join: name at least one")
     scenes: list[Mapping[str, Any]] = [vars(scene) for scene in given]
     kinds = {
         (scene["elements"].shape[1], 0 if scene["material"] is None else scene["material"].shape[1]) for scene in scenes
     }
     if len(kinds) != 1:
-        told = "; ".join(f"{nodes} and {columns}" for nodes, columns in sorted(kinds)) or "no scene"
+        told = "; ".join(f"{nodes} and {columns}" for nodes, columns in sorted(kinds))
         raise DatasetError(
             f"scenes to join must agree in the nodes of an element and the columns of the material; here are: {told}"
         )

@@ -67,7 +67,7 @@ class Scene(ReadOnlyArrays):
             body: [N]; None: each connected part of the mesh is a body, numbered from 0 in the order of its lowest node.
             material: [E, m], or [m] for all elements.
             obstacles: numbers of the bodies all of whose nodes are obstacles.
-            handles: [N] bool, or numbers of nodes: these are handles.
+            handles: [N] bool, or numbers of nodes: these are handles. Obstacles stay what they are; a warning says so.
             name: name of the scene, for messages.
 
         Raises:
@@ -84,6 +84,7 @@ class Scene(ReadOnlyArrays):
 
         Raises:
             DatasetError: the elements have different numbers of nodes, or the materials different columns.
+            ConfigError: there is no scene.
         """
         return cls(**joined_arrays(scenes))
 

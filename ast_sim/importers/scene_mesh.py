@@ -12,6 +12,7 @@ import numpy as np
 from ast_sim.importers.mesh_file import MeshFile, read_mesh
 from ast_sim.importers.places import Place, parse_places
 from ast_sim.material import Material
+from ast_sim.mesh_arrays import of_obstacles
 from ast_sim.mesh_rules import require_extent
 from ast_sim.number_arrays import nodes_of_body, real_numbers, rounding
 from ast_sim.plausibility.topology import at_rest
@@ -67,7 +68,8 @@ def read_scene(
         body_field: point or cell field with the numbers of the bodies. None: "body" if it is present; else each
             connected part of the mesh is a body, numbered from 0 in the order of their lowest nodes.
         type_field: point field with the numbers of `NodeType`. None: "node_type" if it is present; else all nodes are
-            free. `clamps` and then `obstacles` change these types.
+            free. `clamps` and `obstacles` change these types; a body with both is an obstacle, and
+            a warning says so.
         materials: the material of each body by its number, or one material for all bodies. A body whose nodes are all
             obstacles has zeros if it is not named.
         material_fields: instead of `materials`, cell fields with one number each.
@@ -154,17 +156,22 @@ def _node_type(
     """The types of the nodes, and warnings of clamps that hold nodes on a line only."""
     types = scene.node_type.copy()
     doubts = []
+    rigid = [
+        nodes_of_body(scene.body, body) for body in several("obstacles", obstacles, "numbers of bodies, such as [1]")
+    ]
+    of_arguments = np.where(np.any(rigid, axis=0), NodeType.OBSTACLE, NodeType.NORMAL) if rigid else 0 * types
     for clamp in several("clamps", clamps, "texts, such as ['0:xmin']"):
         require_type("a clamp", clamp, str, "a text, such as '0:xmin'")
         held = clamped(mesh, scene, used, clamp)
+        doubts += of_obstacles(f"the clamp {clamp!r}", held, of_arguments, scene.body)
         types[held] = NodeType.HANDLE
         if scene.elements.shape[1] != 3 and _on_a_line(mesh.points[used[held]]):
             body = scene.body[held[0]]
             doubts.append(
                 f"the clamp {clamp!r} holds {len(held)} nodes, which lie on a line: body {body} could turn around it"
             )
-    for body in several("obstacles", obstacles, "the numbers of bodies, such as [1]"):
-        types[nodes_of_body(scene.body, body)] = NodeType.OBSTACLE
+    for nodes in rigid:
+        types[nodes] = NodeType.OBSTACLE
     return types, doubts
 
 
