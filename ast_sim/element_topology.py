@@ -23,6 +23,13 @@ _BLOCK = 4096  # elements whose corners stay in the second cache: larger arrays 
 MIDDLES = ((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))
 
 
+# Where the nodes of an element stand after its corners 2 and 3 have changed places.
+_TURNED = (0, 1, 3, 2, 4, 8, 7, 6, 5, 9)
+
+# A tetrahedron (triangle) is flat if its volume (area) is below this share of its longest edge to the power of 3 (2).
+_FLAT = 1e-6
+
+
 def _middle(a: int, b: int) -> int:
     """The local number of the node between two corners."""
     return 4 + MIDDLES.index((min(a, b), max(a, b)))
@@ -148,6 +155,33 @@ def signed_volumes(points: np.ndarray, elements: np.ndarray) -> np.ndarray:
         six = ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx)
         volumes[first : first + _BLOCK] = six / 6
     return volumes
+
+
+def turned_over(elements: np.ndarray, wrong: np.ndarray) -> np.ndarray:
+    """The tetrahedra [E, 4] or [E, 10], with the ones that `wrong` [E] bool names turned over; also middles alone of
+    some, [E, 6]."""
+    width = elements.shape[1]
+    order = np.array(_TURNED[4:]) - 4 if width == 6 else np.array(_TURNED[:width])
+    return np.where(wrong[:, None], elements[:, order], elements)
+
+
+def flat_elements(points: np.ndarray, elements: np.ndarray) -> np.ndarray:
+    """[E] bool: the tetrahedra without a volume between their corners, or the triangles without an area."""
+    coordinates = np.ascontiguousarray(points.T, np.float64)
+    corners = np.ascontiguousarray(elements[:, :4].T)
+    power = len(corners) - 1
+    if power == 3:
+        size = np.abs(signed_volumes(points, elements))
+    else:
+        x, y, z = (np.take(axis, corners[1:]) - np.take(axis, corners[0]) for axis in coordinates)
+        across = np.stack([a[0] * b[1] - a[1] * b[0] for a, b in ((x, y), (y, z), (z, x))])
+        size = np.linalg.norm(across, axis=0) / 2
+    flat = size <= _FLAT * np.linalg.norm(np.ptp(coordinates, axis=1)) ** power  # no edge is longer
+    rows = np.flatnonzero(flat)
+    ends = coordinates[:, corners[:, rows][np.array(LOCAL_EDGES[len(corners)]).T]]  # [3, 2, edges, rows]
+    longest = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=0).max(axis=0)
+    flat[rows] = size[rows] <= _FLAT * longest**power
+    return flat
 
 
 def point_volumes(points: np.ndarray, elements: np.ndarray) -> np.ndarray:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from enum import IntEnum
-from itertools import combinations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ast_sim.element_topology import CELL_KINDS
+from ast_sim.material import Material
 from ast_sim.number_arrays import (
     connected_parts,
     nodes_of_body,
@@ -17,10 +17,11 @@ from ast_sim.number_arrays import (
     real_numbers,
     require_array,
     require_nodes,
+    rounding,
     whole_numbers,
 )
 from ast_sim.support.argument_checks import in_short, require_line, several
-from ast_sim.support.errors import ConfigError, DatasetError
+from ast_sim.support.errors import ConfigError, DatasetError, warn
 
 if TYPE_CHECKING:
     import meshio
@@ -47,25 +48,47 @@ def scene_arrays(
     """The arrays of a scene by name; arguments and errors are as in `Scene.of`."""
     require_line("name", name)
     position = real_numbers(name, "points", points)
+    exact = np.asarray(points)
     if position.ndim == 2 and position.shape[1] == 2:
-        position = np.pad(position, ((0, 0), (0, 1)))
+        position, exact = (np.pad(rows, ((0, 0), (0, 1))) for rows in (position, exact))
     require_array(name, "points", position, np.float32, (None, 3))
     count = len(position)
     elements = whole_numbers(name, "cells", cells, np.int32)
     require_array(name, "cells", elements, np.int32, (None, None))
     require_nodes(name, "cell", elements, count)
+    for doubt in rounding(exact, position, elements):
+        warn(f"{name}: {doubt}")
     parts = connected_parts(elements, count) if body is None else whole_numbers(name, "body", body, np.int32)
     require_array(name, "body", parts, np.int32, (count,))
     types = whole_numbers(name, "node_type", np.zeros(count) if node_type is None else node_type, np.uint8)
     require_array(name, "node_type", types, np.uint8, (count,))
-    if handles is not None:
-        types[_nodes(name, handles, count)] = NodeType.HANDLE
     for number in several("obstacles", obstacles, "the numbers of bodies, such as [1]"):
         types[nodes_of_body(parts, number)] = NodeType.OBSTACLE
+    if handles is not None:
+        nodes = _nodes(name, handles, count)
+        for doubt in of_obstacles("handles", nodes, types, parts):
+            warn(f"{name}: {doubt}")
+        types[nodes[types[nodes] != NodeType.OBSTACLE]] = NodeType.HANDLE
+    if isinstance(material, Material | Mapping):
+        raise ConfigError(
+            f"material is {in_short(material)}; it must be numbers, [E, m] or [m], such as (2e5, 0.3): their names"
+            " belong to a dataset (DatasetInfo.generator) or a run"
+        )
     columns = None if material is None else real_numbers(name, "material", material)
     if columns is not None and columns.ndim == 1:
         columns = np.tile(columns, (len(elements), 1))
     return {"rest_position": position, "elements": elements, "node_type": types, "body": parts, "material": columns}
+
+
+def of_obstacles(what: str, nodes: np.ndarray, types: np.ndarray, body: np.ndarray) -> list[str]:
+    """One sentence if some of the nodes, which `what` would make handles, are obstacles, which they stay."""
+    rigid = nodes[types[nodes] == NodeType.OBSTACLE]
+    if not len(rigid):
+        return []
+    return [
+        f"{what}: {len(rigid)} of {len(nodes)} nodes stay obstacles, the first is node {rigid[0]} of body"
+        f" {body[rigid[0]]}: an obstacle moves as a whole"
+    ]
 
 
 def _nodes(name: str, handles: Any, count: int) -> np.ndarray:
@@ -86,12 +109,14 @@ def joined_arrays(given: Sequence[Any]) -> dict[str, Any]:
     for scene in given:
         if not hasattr(scene, "rest_position"):
             raise ConfigError(f"a scene to join is {in_short(scene)}; it must be a Scene")
+    if not given:
+        raise ConfigError("there is no scene to join: name at least one")
     scenes: list[Mapping[str, Any]] = [vars(scene) for scene in given]
     kinds = {
         (scene["elements"].shape[1], 0 if scene["material"] is None else scene["material"].shape[1]) for scene in scenes
     }
     if len(kinds) != 1:
-        told = "; ".join(f"{nodes} and {columns}" for nodes, columns in sorted(kinds)) or "no scene"
+        told = "; ".join(f"{nodes} and {columns}" for nodes, columns in sorted(kinds))
         raise DatasetError(
             f"scenes to join must agree in the nodes of an element and the columns of the material; here are: {told}"
         )
@@ -143,21 +168,3 @@ def mesh_of_arrays(
         point_data={"node_type": node_type.copy(), "body": body.copy()},
         cell_data={} if material is None else {"material": [material.copy()]},
     )
-
-
-def require_mesh(name: str, elements: np.ndarray, node_type: np.ndarray, body: np.ndarray) -> None:
-    """Raise DatasetError if an element refers to a node twice, if the type of a node is no `NodeType`, or if a body has
-    a number below 0; the text names `name` and the first one."""
-    pairs = combinations(range(elements.shape[1]), 2)
-    repeated = np.logical_or.reduce([elements[:, a] == elements[:, b] for a, b in pairs])
-    if repeated.any():
-        row = int(np.argmax(repeated))
-        raise DatasetError(f"{name}: element {row} refers to a node twice: {elements[row].tolist()}")
-    unknown = np.logical_and.reduce([node_type != kind for kind in NodeType])
-    if unknown.any():
-        node = int(np.argmax(unknown))
-        known = ", ".join(f"{kind.value} {kind.name}" for kind in NodeType)
-        raise DatasetError(f"{name}: node {node} has the type {node_type[node]}; known are {known}")
-    if (body < 0).any():
-        node = int(np.argmax(body < 0))
-        raise DatasetError(f"{name}: node {node} is of the body {body[node]}, but bodies are numbered from 0")

@@ -13,6 +13,9 @@ from ast_sim.support.argument_checks import in_short, several
 from ast_sim.support.errors import ConfigError, DatasetError, counted
 from ast_sim.support.toml_settings import required_whole
 
+# Rounding to float32 may move points by this share of the shortest edge before a warning is given.
+_ROUNDING = 0.01
+
 # Elements from which the search for connected parts makes pairs of nodes at a time. This limits its memory.
 _ELEMENTS_AT_ONCE = 1 << 13
 
@@ -32,6 +35,22 @@ def real_numbers(name: str, array: str, value: Any) -> np.ndarray:
     if too_large.any():
         raise DatasetError(f"{name}: {array} holds {given[too_large][0]:g}, which is too large for float32")
     return single
+
+
+def rounding(exact: np.ndarray, rounded: np.ndarray, elements: np.ndarray) -> list[str]:
+    """One sentence if points [N, 3] lie elsewhere as float32, by a share of the shortest edge of elements [E, k]."""
+    with np.errstate(invalid="ignore"):  # inf - inf; a check of the points tells of them
+        off = float(np.abs(rounded - exact).max(initial=0))
+        corners = exact[elements[:, :4]].astype(np.float64)
+        lengths = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
+    shortest = float(lengths[lengths > 0].min(initial=np.inf))
+    if not off > _ROUNDING * shortest:
+        return []
+    farthest = float(np.abs(exact).max())
+    return [
+        f"rounding to float32 moves points by up to {off:.3g}, and the shortest edge is {shortest:.3g}: the mesh is too"
+        f" fine for coordinates of up to {farthest:.3g}; move it to the origin"
+    ]
 
 
 def three_numbers(name: str, array: str, value: Any) -> np.ndarray:

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ast_sim.element_topology import LOCAL_EDGES, signed_volumes, surface_triangles, unique_edges
-from ast_sim.mesh_arrays import NodeType, arrays_of_mesh, joined_arrays, mesh_of_arrays, require_mesh, scene_arrays
+from ast_sim.mesh_arrays import NodeType, arrays_of_mesh, joined_arrays, mesh_of_arrays, scene_arrays
+from ast_sim.mesh_rules import require_deforming, require_mesh
 from ast_sim.named_field import NamedField
 from ast_sim.number_arrays import ascending, ranges, require_array, require_finite, require_nodes, require_numbering
 from ast_sim.scene_summary import scene_drawing, scene_facts
@@ -66,7 +67,7 @@ class Scene(ReadOnlyArrays):
             body: [N]; None: each connected part of the mesh is a body, numbered from 0 in the order of its lowest node.
             material: [E, m], or [m] for all elements.
             obstacles: numbers of the bodies all of whose nodes are obstacles.
-            handles: [N] bool, or numbers of nodes: these are handles.
+            handles: [N] bool, or numbers of nodes: these are handles. Obstacles stay what they are; a warning says so.
             name: name of the scene, for messages.
 
         Raises:
@@ -83,6 +84,7 @@ class Scene(ReadOnlyArrays):
 
         Raises:
             DatasetError: the elements have different numbers of nodes, or the materials different columns.
+            ConfigError: there is no scene.
         """
         return cls(**joined_arrays(scenes))
 
@@ -183,12 +185,9 @@ class Scene(ReadOnlyArrays):
         require_mesh(name, self.elements, self.node_type, self.body)
 
     def require_predictable(self, name: str) -> None:
-        """Raise DatasetError if no node is free, or if the deforming bodies have no extent; the text names `name`."""
-        if self.prescribed.all():
-            raise DatasetError(f"{name}: all nodes are obstacles or handles, so nothing deforms: leave this scene out")
-        points = self.rest_position[self.deforming_nodes]
-        if (points == points[0]).all():
-            raise DatasetError(f"{name}: all nodes that deform lie at one point at rest: give them their positions")
+        """Raise DatasetError if no node is free, or if an element of the deforming bodies has no volume (a triangle: no
+        area); the text names `name`, the first element and their number."""
+        require_deforming(name, self.rest_position, self.elements, self.node_type)
 
     def edges(self) -> np.ndarray:
         """[M, 2] int32: each edge of the mesh once, its smaller node first, in ascending order."""

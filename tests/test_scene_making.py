@@ -133,7 +133,7 @@ def test_joined_scenes_count_on():
     scene.check()
     with pytest.raises(DatasetError, match="agree in the nodes of an element and the columns of the material"):
         Scene.join(one, two_tetrahedra(material=np.ones((2, 1), np.float32)))
-    with pytest.raises(DatasetError, match="here are: no scene"):
+    with pytest.raises(ConfigError, match="there is no scene to join: name at least one"):
         Scene.join()
     last = Scene.of(POINTS, CELLS, body=[2**31 - 1] * 8)
     assert Scene.join(last).body.tolist() == [2**31 - 1] * 8
@@ -171,3 +171,38 @@ def test_sizes_and_cells_must_be_above_zero():
         ast_sim.ball((0, 0, 0), 1, 3)
     with pytest.raises(ConfigError, match="the axis of the cylinder is 'w'; must be x, y or z"):
         ast_sim.cylinder((0, 0, 0), 1, 1, 4, axis="w")
+
+
+@pytest.mark.parametrize(
+    "make", [lambda: ast_sim.ball((0, 0, 0), 1, 2000), lambda: ast_sim.cylinder((0, 0, 0), 1, 1, 2000)]
+)
+def test_bodies_of_too_many_cells_are_refused(make):
+    with pytest.raises(
+        ConfigError, match="has 2000 x 2000 x 2000 cells; more than 10,000,000 are too many for one scene"
+    ):
+        make()
+
+
+def test_holes_that_leave_no_plate_or_two_are_told():
+    with pytest.raises(ConfigError, match="the holes leave no cell of the plate: make them smaller, or move them"):
+        ast_sim.plate((1, 1, 0.1), (4, 4, 1), holes=[(0, 0, 5)])
+    with pytest.warns(UserWarning, match="the holes cut the plate into 2 pieces, each a body of its own"):
+        cut = ast_sim.plate((1, 0.2, 0.1), (10, 2, 1), holes=[(0, 0, 0.15)])
+    assert len(np.unique(cut.body)) == 2
+
+
+@pytest.mark.parametrize("given", [{"obstacles": [0]}, {"node_type": [1] * 27}])
+def test_obstacles_stay_obstacles_where_handles_are_named(given):
+    with pytest.warns(
+        UserWarning, match="scene: handles: 1 of 1 nodes stay obstacles, the first is node 0 of body 0: an"
+    ):
+        scene = ast_sim.box((0, 0, 0), (1, 1, 1), (2, 2, 2), handles=[0], **given)
+    assert (scene.node_type == 1).all()
+
+
+@pytest.mark.parametrize("material", [ast_sim.Material(("young",)), {"young": 1.0}])
+def test_a_material_of_a_scene_is_numbers(material):
+    with pytest.raises(
+        ConfigError, match=r"material is of the type .*; it must be numbers, \[E, m\] or \[m\], such as"
+    ):
+        ast_sim.box((0, 0, 0), (1, 1, 1), (1, 1, 1), material=material)

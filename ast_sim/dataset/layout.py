@@ -93,8 +93,7 @@ class DatasetInfo:
                 raise DatasetError(f"{name}: {key} is {getattr(self, key)!r}; must be one of {', '.join(allowed)}")
         if not isinstance(self.family, str) or not self.family:
             raise DatasetError(f"{name}: family is {in_short(self.family)}; must be a text")
-        if not isinstance(self.generator, Mapping):
-            raise DatasetError(f"{name}: generator is {in_short(self.generator)}; must be facts by name")
+        self._check_generator(name)
         three_numbers(name, "domain_center", self.domain_center)
         for key in ("domain_half_width", "contact_radius", "time_step"):
             number = real_numbers(name, key, getattr(self, key))
@@ -102,6 +101,23 @@ class DatasetInfo:
                 raise DatasetError(f"{name}: {key} must be one finite number, not {in_short(getattr(self, key))}")
         if self.domain_half_width <= 0 or self.contact_radius < 0 or self.time_step < 0:
             raise DatasetError(f"{name}: domain_half_width must be above 0, contact_radius and time_step at least 0")
+
+    def _check_generator(self, name: str) -> None:
+        """Raise DatasetError unless the origin of the data is facts that JSON holds, with names of columns that fit."""
+        if not isinstance(self.generator, Mapping):
+            raise DatasetError(f"{name}: generator is {in_short(self.generator)}; must be facts by name")
+        for key, value in self.generator.items():
+            try:
+                json.dumps({key: value}, sort_keys=True)
+            except (TypeError, ValueError) as error:  # no kind of JSON; or it holds itself
+                raise DatasetError(f"{name}: generator[{key!r}] is nothing that JSON holds: {error}") from error
+        columns = self.generator.get("material", [])
+        texts = isinstance(columns, list | tuple) and all(isinstance(one, str) and one for one in columns)
+        if not texts or len(set(columns)) < len(columns):
+            raise DatasetError(
+                f"{name}: generator['material'] is {columns!r}; must be a list with one name for each column of the"
+                " material, such as ['young', 'poisson']"
+            )
 
     def in_unit(self, unit: str, name: str) -> DatasetInfo:
         """The same facts in another unit of length.
@@ -127,20 +143,19 @@ class DatasetInfo:
         "column 1" and so on.
 
         Raises:
-            DatasetError: there are names for another number of columns, or a name twice.
+            DatasetError: there are names for another number of columns.
         """
         named = self.generator.get("material")
         if named is None:
             generated = _GENERATED.get(self.family, ())[:width]
             unnamed = tuple(f"column {number}" for number in range(width))
             return Material(generated if len(generated) == width else unnamed)
-        names = tuple(map(str, named)) if isinstance(named, list | tuple) else (str(named),)
-        if len(names) != width or len(set(names)) != width:
+        if len(named) != width:
             raise DatasetError(
                 f"the material has {counted(width, 'column')}, but generator['material'] names"
-                f" {', '.join(names) or 'none'}: give each column one name"
+                f" {', '.join(named) or 'none'}: give each column one name"
             )
-        return Material(names)
+        return Material(named)
 
     def times(self, frames: Iterable[int]) -> tuple[float, ...] | None:
         """The times of frames in seconds, by their numbers; None if frames have no time."""

@@ -25,11 +25,12 @@ from ast_sim.dataset.layout import (
     trajectory_hash,
     write_attributes,
 )
+from ast_sim.material import hints
 from ast_sim.named_field import require_same_fields
-from ast_sim.scene import Trajectory
+from ast_sim.scene import Scene, Trajectory
 from ast_sim.support.argument_checks import file_name, require_type
 from ast_sim.support.disk import Disk, output_file, sync_folder, temporary_name
-from ast_sim.support.errors import DatasetError
+from ast_sim.support.errors import DatasetError, warn
 
 # On each side the domain is larger than the positions by this share of their largest extent.
 MARGIN = 0.1
@@ -78,7 +79,9 @@ class DatasetWriter:
         require_type("the attributes", trajectory.attributes, Mapping, "values by name")
         name = f"{split}/{self.counts[split]:06d}"
         trajectory.check(f"{self.path}: {name}", self.info.stress_location)
+        first = self._kind is None
         self._kind = require_kind(f"{self.path}: {name}", trajectory.scene, self._kind)
+        self._require_material(f"{self.path}: {name}", trajectory.scene, first)
         self._fields = require_same_fields(f"{self.path}: {name}", trajectory.fields, self._fields)
         if trajectory.length_unit not in (None, self.info.length_unit):
             raise DatasetError(
@@ -97,6 +100,18 @@ class DatasetWriter:
             attributes = {key: plain_value(value) for key, value in group.attrs.items()}
             write_attributes(group, {HASH: trajectory_hash(hashes, attributes)})
         self.counts[split] += 1
+
+    def _require_material(self, name: str, scene: Scene, first: bool) -> None:
+        """Raise DatasetError unless the material has a name for each column and numbers that a material can have; the
+        `first` time, hint at names that look like others."""
+        width = 0 if scene.material is None else scene.material.shape[1]
+        try:
+            material = self.info.material(width)
+        except DatasetError as error:
+            raise DatasetError(f"{name}: {error}") from error
+        for hint in hints(material.columns) if first else ():
+            warn(f"{self.path}: {hint}")
+        material.require_possible(name, scene.material, ~scene.rigid_elements)
 
     def _store(self, group: h5py.Group, key: str, array: np.ndarray, chunks: tuple[int, ...], **facts: str) -> str:
         """Store an array with its hash and other facts; return the hash."""

@@ -66,7 +66,8 @@ def frames_in(path: Path) -> Iterator[SourceMesh]:
         MissingExtra: the reader of the format is not installed.
     """
     if not path.is_file():
-        raise DatasetError(f"{path}: there is no such file")
+        what = "is a folder: name a file in it" if path.is_dir() else "there is no such file"
+        raise DatasetError(f"{path}: {what}")
     ending = path.suffix.lower()
     true = _ending_of_vtk(path) if ending in (".vtk", ".vtu", ".vtp", ".vts") else ending
     if true != ending:

@@ -11,8 +11,10 @@ import numpy as np
 
 from ast_sim.importers.mesh_file import MeshFile, read_mesh
 from ast_sim.importers.places import Place, parse_places
-from ast_sim.importers.solids.mesh_elements import require_extent
-from ast_sim.number_arrays import nodes_of_body, real_numbers
+from ast_sim.material import Material
+from ast_sim.mesh_arrays import of_obstacles
+from ast_sim.mesh_rules import require_extent
+from ast_sim.number_arrays import nodes_of_body, real_numbers, rounding
 from ast_sim.plausibility.topology import at_rest
 from ast_sim.scene import NodeType, Scene
 from ast_sim.support.argument_checks import file_name, in_short, require_bool, require_type, several
@@ -23,9 +25,6 @@ if TYPE_CHECKING:
 
 # Nodes lie on a line if their second extent, as a share of the first, is below this.
 _ON_A_LINE = 1e-3
-
-# Rounding to float32 may move points by this share of the shortest edge before a warning is given.
-_ROUNDING = 0.01
 
 Numbers = float | Sequence[float]
 
@@ -69,7 +68,8 @@ def read_scene(
         body_field: point or cell field with the numbers of the bodies. None: "body" if it is present; else each
             connected part of the mesh is a body, numbered from 0 in the order of their lowest nodes.
         type_field: point field with the numbers of `NodeType`. None: "node_type" if it is present; else all nodes are
-            free. `clamps` and then `obstacles` change these types.
+            free. `clamps` and `obstacles` change these types; a body with both is an obstacle, and
+            a warning says so.
         materials: the material of each body by its number, or one material for all bodies. A body whose nodes are all
             obstacles has zeros if it is not named.
         material_fields: instead of `materials`, cell fields with one number each.
@@ -88,7 +88,7 @@ def read_scene(
     mesh = read_mesh(source, used_fields=used_fields, corners=corners)
     scene, used = mesh.scene(body_field, type_field)
     scene.check(str(mesh.path))
-    require_extent(mesh.path, mesh.points[used], scene.elements)
+    require_extent(str(mesh.path), mesh.points[used], scene.elements)
     types, doubts = _node_type(mesh, scene, used, obstacles, clamps)
     scene = replace(scene, node_type=types)
     scene = replace(scene, material=_material(mesh, scene, materials, material_fields))
@@ -98,21 +98,8 @@ def read_scene(
             " clamps=['BODY:PLACE'] (--clamp BODY:PLACE), for example 0:xmin"
         )
     scene.check(str(mesh.path))
-    looks_wrong = [str(finding) for finding in at_rest(scene)]
-    return SceneMesh(scene, [*mesh.notes], [*doubts, *_rounded(mesh, scene, used), *looks_wrong])
-
-
-def _rounded(mesh: MeshFile, scene: Scene, used: np.ndarray) -> list[str]:
-    """A warning if points far from the origin lie elsewhere as float32, by a share of an edge."""
-    off = float(np.abs(scene.rest_position - mesh.points[used]).max())
-    shortest = min(_shortest_edge(scene, int(body)) for body in np.unique(scene.body))
-    if off <= _ROUNDING * shortest:
-        return []
-    farthest = float(np.abs(scene.rest_position).max())
-    return [
-        f"rounding to float32 moves points by up to {off:.3g}, and the shortest edge is {shortest:.3g}: the mesh is too"
-        f" fine for coordinates of up to {farthest:.3g}; move it to the origin"
-    ]
+    doubts += rounding(mesh.points[used], scene.rest_position, scene.elements)
+    return SceneMesh(scene, [*mesh.notes], [*doubts, *map(str, at_rest(scene))])
 
 
 def describe(scene: Scene) -> list[str]:
@@ -173,9 +160,14 @@ def _node_type(
     """The types of the nodes, and warnings of clamps that hold nodes on a line only."""
     types = scene.node_type.copy()
     doubts = []
+    rigid = [
+        nodes_of_body(scene.body, body) for body in several("obstacles", obstacles, "numbers of bodies, such as [1]")
+    ]
+    of_arguments = np.where(np.any(rigid, axis=0), NodeType.OBSTACLE, NodeType.NORMAL) if rigid else 0 * types
     for clamp in several("clamps", clamps, "texts, such as ['0:xmin']"):
         require_type("a clamp", clamp, str, "a text, such as '0:xmin'")
         held = clamped(mesh, scene, used, clamp)
+        doubts += of_obstacles(f"the clamp {clamp!r}", held, of_arguments, scene.body)
         types[held] = NodeType.HANDLE
         if scene.elements.shape[1] != 3 and _on_a_line(mesh.points[used[held]]):
             body = scene.body[held[0]]
@@ -183,8 +175,8 @@ def _node_type(
                 f"the clamp {clamp!r} holds {counted(len(held), 'node')}, on one line, around which body {body} could"
                 " turn"
             )
-    for body in several("obstacles", obstacles, "the numbers of bodies, such as [1]"):
-        types[nodes_of_body(scene.body, body)] = NodeType.OBSTACLE
+    for nodes in rigid:
+        types[nodes] = NodeType.OBSTACLE
     return types, doubts
 
 
@@ -229,13 +221,21 @@ def _material(
 ) -> np.ndarray | None:
     """[E, m] float32; None if no material is given."""
     if materials is None:
-        return mesh.columns(fields)
+        columns = mesh.columns(fields)
+        Material(tuple(fields)).require_possible(str(mesh.path), columns, ~scene.rigid_elements)
+        return columns
     if fields:
         raise ConfigError("the material is given twice: by body and by cell fields; leave one out")
     bodies = [int(body) for body in np.unique(scene.body)]
     rigid = scene.rigid_bodies
     deforming = [body for body in bodies if body not in rigid]
     given = materials if isinstance(materials, Mapping) else dict.fromkeys(deforming, materials)
+    for body, one in given.items():
+        if isinstance(one, Mapping):
+            raise ConfigError(
+                f"the material of body {body} is {in_short(one)}; it must be a number or numbers, in the order of the"
+                " columns of the training, such as (2e5, 0.3)"
+            )
     numbers = {body: real_numbers(str(mesh.path), "materials", one) for body, one in given.items()}
     rows = {body: np.atleast_1d(one) for body, one in numbers.items()}
     for body in rows:

@@ -22,7 +22,6 @@ from ast_sim.importers.solids.constant_fields import ConstantFields
 from ast_sim.importers.solids.frames_match import in_order_of, order_of_cells
 from ast_sim.importers.solids.kept_fields import KeptFields
 from ast_sim.importers.solids.kept_frames import KeptFrames
-from ast_sim.importers.solids.mesh_elements import require_extent
 from ast_sim.importers.solids.positions import (
     far_origin,
     fields_of_components,
@@ -36,6 +35,7 @@ from ast_sim.importers.solved_jobs.job import Job, read_job
 from ast_sim.importers.solved_jobs.job_results import job_frames
 from ast_sim.importers.stress import STRESS_UNITS, of_components, order_of, stress_place, von_mises
 from ast_sim.material import PRESSURES
+from ast_sim.mesh_rules import require_extent
 from ast_sim.plausibility.axes import MIRRORED
 from ast_sim.scene import NodeType, Scene, Trajectory
 from ast_sim.support.argument_checks import several
@@ -139,7 +139,7 @@ def read_series(
     scene, used = mesh.scene(names.body, names.node_type)
     types = _node_type(mesh, names, scene, used)
     rest, position = _rest_and_position(source, mesh, kept, used)
-    require_extent(source, rest, scene.elements)
+    require_extent(str(source), rest, scene.elements)
     origin = far_origin(position[0]) if origin is None else origin
     warn_of_rounding(source, rest - origin, position - origin)
     scene = replace(

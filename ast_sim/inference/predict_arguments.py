@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from ast_sim.inference.predicting.question import Question, WantedFrames, fields
 from ast_sim.models.model_config import ModelConfig
 from ast_sim.named_field import STRESS, require_fields
 from ast_sim.number_arrays import ranges, real_numbers, require_finite
+from ast_sim.plausibility.topology import no_scene
 from ast_sim.prescribed_motion import Motion, RigidMotion, Vector, frames_for
 from ast_sim.runs.scope import Scope, spacing_of
 from ast_sim.scene import Scene, Trajectory
@@ -20,6 +22,7 @@ from ast_sim.support.errors import ConfigError, DatasetError, counted
 from ast_sim.support.toml_settings import whole
 
 LEAST_RESOLVED = 0.01  # of a mean edge: rounding of the positions may be as large
+_AT_REST: WeakKeyDictionary[Scene, list[str]] = WeakKeyDictionary()  # what looks wrong in the scenes that are in use
 Motions = Motion | Mapping[int, RigidMotion | Vector] | np.ndarray
 
 
@@ -62,7 +65,7 @@ def new_question(
     scene.require_predictable(name)  # before anything is told of such a scene
     _require_material(config, scope, scene, name)
     _require_resolved(scene, name)
-    notes = (*notes, *_loose(scene), *scope.notes(scene, motion, config.scheme.needs_each_frame))
+    notes = (*notes, *_loose(scene), *_at_rest(scene), *scope.notes(scene, motion, config.scheme.needs_each_frame))
     return Question(name, scene, motion.position, fields, movable=True, notes=notes).asking(frames)
 
 
@@ -108,6 +111,13 @@ def _loose(scene: Scene) -> list[str]:
         if count
         else []
     )
+
+
+def _at_rest(scene: Scene) -> list[str]:
+    """Notes if bodies lie in each other at rest, or a mesh folds over itself; looked at once for each scene."""
+    if scene not in _AT_REST:
+        _AT_REST[scene] = [str(finding) for finding in no_scene(scene)]
+    return _AT_REST[scene]
 
 
 def _require_whole(trajectory: Trajectory, config: ModelConfig, scope: Scope, name: str) -> None:
@@ -179,10 +189,13 @@ def _given_stress(config: ModelConfig, scene: Scene, stress: np.ndarray | None, 
 
 
 def _require_material(config: ModelConfig, scope: Scope, scene: Scene, name: str) -> None:
-    """Raise ConfigError unless the scene has as many material columns as the training scenes."""
+    """Raise ConfigError unless the scene has as many material columns as the training scenes, or DatasetError if they
+    hold what no material has."""
     wanted = config.data.material_width
     given = 0 if scene.material is None else scene.material.shape[1]
     if given == wanted:
+        if given:
+            config.data.material.require_possible(name, scene.material, ~scene.rigid_elements)
         return
     if not wanted:
         raise ConfigError(

@@ -106,7 +106,7 @@ class Run:
 
     @property
     def info(self) -> DatasetInfo:
-        """The units and the kind of the predictions."""
+        """The units and the kind of the predictions, and the names of their material."""
         model, scope = self.settings.model, self.scope
         return DatasetInfo(
             family=scope.family,
@@ -117,7 +117,7 @@ class Run:
             contact_radius=model.data.contact_radius,
             time_step=scope.time_step,
             length_unit=scope.length_unit,
-            generator={"program": "ast_sim predict"},
+            generator={"program": "ast_sim predict", "material": list(model.data.columns)},
         )
 
     def predict(
@@ -342,6 +342,7 @@ class Run:
         (solver_scenes,) = required_whole(0, solver_scenes=solver_scenes)
         require_type("command", command, str, "a text")
         with self.open(data) as dataset:
+            self.folder.warn_if_learned(dataset, split)
             steps = 2 * dataset.count(split) + min(solver_scenes, dataset.count(split))
             with Progress(steps, "scenes", progress) as bar:
                 figures = evaluate(self.model, dataset, split, bar.advance, self.effort, solver_scenes, made_from)

@@ -15,7 +15,7 @@ from ast_sim.element_topology import node_areas, signed_volumes, unit_normals
 from ast_sim.material import FRICTION, Material
 from ast_sim.mechanics.contact_and_friction import ContactSettings, load_ipctk
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean
-from ast_sim.mechanics.elements.second_order import elastic_body
+from ast_sim.mechanics.elements.second_order import deforming_body
 from ast_sim.mechanics.linearised.contact_forces import ContactForces, free_of_themselves
 from ast_sim.mechanics.linearised.linearised_contact import CLEARANCE, NewtonSteps
 from ast_sim.mechanics.solver import SolverSettings
@@ -228,9 +228,7 @@ class _Balance:
 
     def __init__(self, scene: Scene, law: Law) -> None:
         deforming = np.flatnonzero(~scene.rigid_elements)
-        elements = scene.elements[deforming].astype(np.int64)
-        rest = scene.rest_position.astype(np.float64)
-        self._elasticity = elastic_body(rest, elements, law.of_elements(scene).of(deforming))
+        self._elasticity = deforming_body(scene, deforming, law.of_elements(scene))
         load_ipctk()  # without pairs of edges, what is left says nothing
         self._contact = ContactForces(scene, law.contact_range, law.friction(scene))
         self._held = scene.prescribed

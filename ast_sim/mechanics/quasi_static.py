@@ -12,7 +12,7 @@ import numpy as np
 from ast_sim.mechanics.case import SolidCase
 from ast_sim.mechanics.contact_and_friction import Contact
 from ast_sim.mechanics.elements.neo_hookean import von_mises
-from ast_sim.mechanics.elements.second_order import elastic_body
+from ast_sim.mechanics.elements.second_order import deforming_body
 from ast_sim.mechanics.frames import MAX_FRAME_ITERATIONS, FrameRecord, Frames, GivenUp
 from ast_sim.mechanics.linearised.linearised_contact import NewtonSteps
 from ast_sim.mechanics.load_halving import QuasiStatic
@@ -152,7 +152,7 @@ class SolidFrames(Frames[SolidRecord]):
         rest = case.scene.rest_position.astype(np.float64)
         self._deforming = np.flatnonzero(~case.scene.rigid_elements)
         if prepared is None:
-            self._elasticity = elastic_body(rest, scene.elements[self._deforming], case.material.of(self._deforming))
+            self._elasticity = deforming_body(scene, self._deforming, case.material)
             system = None
         else:
             self._elasticity = prepared.elasticity

@@ -22,7 +22,7 @@ from scipy.sparse.linalg import cg
 from ast_sim.element_topology import linear_elements, node_normals
 from ast_sim.mechanics.driven import Driven
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean
-from ast_sim.mechanics.elements.second_order import elastic_body
+from ast_sim.mechanics.elements.second_order import deforming_body
 from ast_sim.mechanics.linearised.contact_forces import ContactForces
 from ast_sim.scene import Scene
 from ast_sim.support.errors import SimulationError
@@ -58,8 +58,8 @@ class Reaction:
         self.unseen = self.rough = False
         self._rest = scene.rest_position.astype(np.float64)
         soft = np.flatnonzero(~scene.rigid_elements)
-        self._elasticity = elastic_body(self._rest, scene.elements[soft], law.of(soft))
-        linear = linear_elements(scene.elements[soft].astype(np.int64))
+        self._elasticity = deforming_body(scene, soft, law)
+        linear = linear_elements(self._elasticity.elements)
         self._laplacian = -igl.cotmatrix(self._rest, linear).tocsr()
         surface = scene.surface()
         owner = scene.body[surface[:, 0]]  # a node of no element may be a body without a surface

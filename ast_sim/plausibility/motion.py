@@ -56,7 +56,7 @@ def in_trajectory(trajectory: Trajectory, dynamic: bool = False) -> list[Finding
     findings += _turn_over(scene, position)
     if dynamic:  # else a frame is the one before once more wherever all prescribed nodes hold still
         findings += _stops_dead(position)
-    findings += _negative_stress(trajectory)
+    findings += negative_stress(trajectory)
     findings += [*change_places(scene, position), *counted_from_frame_before(scene, position)]
     return [*findings, *_contact(scene, position)]
 
@@ -74,7 +74,7 @@ def _poisson(trajectory: Trajectory) -> list[Finding]:
     return [Finding("elements whose Poisson's ratio cannot be one", len(rows), places("elements", rows), meaning)]
 
 
-def _negative_stress(trajectory: Trajectory) -> list[Finding]:
+def negative_stress(trajectory: Trajectory) -> list[Finding]:
     """Stresses below zero by more than a smooth field is that was carried from elements to nodes."""
     if trajectory.stress is None:
         return []

@@ -22,20 +22,8 @@ def at_rest(scene: Scene) -> list[Finding]:
     """What looks wrong in a scene at rest."""
     findings = [*_twice(scene), *_free_nodes(scene), *_single_elements(scene)]
     if scene.elements.shape[1] != 3:
-        findings += [*_inside_out(scene), *_folds(scene), *_faces_on_faces(scene), *overlaps(scene)]
+        findings += [*_inside_out(scene), *folds(scene), *_faces_on_faces(scene), *overlaps(scene)]
     return findings
-
-
-def turned_over(scene: Scene) -> np.ndarray | None:
-    """[E, 4]: the elements; if inside out, with their last two nodes exchanged. None if none is inside out."""
-    if scene.elements.shape[1] != 4:
-        return None
-    wrong = scene.rest_volumes < 0
-    if not wrong.any():
-        return None
-    elements = scene.elements.copy()
-    elements[wrong] = elements[wrong][:, [0, 1, 3, 2]]
-    return elements
 
 
 def _twice(scene: Scene) -> list[Finding]:
@@ -65,15 +53,26 @@ def _single_elements(scene: Scene) -> list[Finding]:
 
 
 def _inside_out(scene: Scene) -> list[Finding]:
-    """Elements that have no volume where forces are integrated. In second-order ones a piece between nodes and curved
-    edges may be inside out all the same."""
-    volumes = point_volumes(scene.rest_position, scene.elements)
+    """Elements that have no volume where forces are integrated, however their nodes are numbered. In second-order ones
+    a piece between nodes and curved edges may be inside out all the same."""
+    volumes = np.where(scene.rest_volumes < 0, -1, 1) * point_volumes(scene.rest_position, scene.elements)
     rows = np.flatnonzero((volumes <= 0).any(axis=0))
-    meaning = "the order of their nodes is another one, or they are flat: they cannot be computed with"
+    meaning = "they are flat, or their edges are bent too far: they cannot be computed with"
     return [Finding("elements inside out", len(rows), _elements(scene, rows), meaning)] if len(rows) else []
 
 
-def _folds(scene: Scene) -> list[Finding]:
+def no_scene(scene: Scene) -> list[Finding]:
+    """What no bodies of tetrahedra can be at rest: inside each other, or folded so that elements are inside out."""
+    return [] if scene.elements.shape[1] == 3 else [*folded_inside_out(scene), *overlaps(scene)]
+
+
+def folded_inside_out(scene: Scene) -> list[Finding]:
+    """As `folds`, if a tetrahedron is inside out. It may be numbered so, which does no harm."""
+    may_fold = scene.elements.shape[1] != 3 and bool((scene.rest_volumes < 0).any())
+    return folds(scene) if may_fold else []
+
+
+def folds(scene: Scene) -> list[Finding]:
     """Faces of more than two elements, and faces whose two elements lie on the same side of them."""
     faces = scene.elements[:, np.array(LOCAL_FACES)].reshape(-1, 3).astype(np.int64)
     negative = np.repeat(scene.rest_volumes < 0, 4)

@@ -175,6 +175,11 @@ class RunFolder:
         if same_place and self.origin.get("data") not in (None, dataset.fingerprint()):
             warn(f"{dataset.path} holds other scenes than when {self.path} was trained on it")
 
+    def warn_if_learned(self, dataset: Dataset, split: str) -> None:
+        """Warn if the run learned from the scenes of this split: its errors there are no errors in new scenes."""
+        if split == "train" and Path(self.settings.data) == dataset.absolute_path:
+            warn(f"{self.path} learned from these scenes ({dataset.path}, split train): new ones have larger errors")
+
     def describe(self) -> dict[str, Any]:
         """What `ast-sim info` says of a run: its settings, the checkpoint that it starts from, its checkpoints and the
         best validation.

@@ -11,12 +11,16 @@ import numpy as np
 from ast_sim.batches.frame_pairs import target_counts
 from ast_sim.dataset.reader import Dataset
 from ast_sim.inference.evaluation.measures import SquaredError, rmse_pooled
+from ast_sim.material import hints
 from ast_sim.models.data_facts import DataFacts
 from ast_sim.models.model_config import ModelConfig
+from ast_sim.plausibility.findings import Finding, refusal
+from ast_sim.plausibility.motion import negative_stress
+from ast_sim.plausibility.topology import folded_inside_out
 from ast_sim.prescribed_motion import Motion
 from ast_sim.runs.scope import Scope, edge_lengths, held_share_of, size_of, spacing_of
 from ast_sim.scene import AttributeValue, NodeType
-from ast_sim.support.errors import TrainingError
+from ast_sim.support.errors import TrainingError, warn
 
 # Facts of the data (`DataFacts`), and the attributes of trajectories that hold them.
 RECORDED = {"young": "young", "poisson": "poisson", "contact_range": "dhat", "friction": "friction"}
@@ -54,7 +58,7 @@ def measure(dataset: Dataset) -> DataScales:
 
     Raises:
         TrainingError: the split is empty.
-        DatasetError: in one of these scenes nothing can deform.
+        DatasetError: in one of these scenes nothing can deform, or its material cannot be one.
     """
     count = dataset.count("train")
     if count == 0:
@@ -67,9 +71,12 @@ def measure(dataset: Dataset) -> DataScales:
     planar = True
     center = np.array(dataset.info.domain_center)
     room = math.inf
+    doubts: list[tuple[str, Finding]] = []
     for name, trajectory in dataset.spread("train", MEASURED):
         scene, position = trajectory.scene, trajectory.position
         scene.require_predictable(name)
+        dataset.material.require_possible(name, scene.material, ~scene.rigid_elements)
+        doubts += [(name, finding) for finding in (*folded_inside_out(scene), *negative_stress(trajectory))]
         normal = scene.node_type == NodeType.NORMAL
         displacement.append(SquaredError.between(position, scene.rest_position, normal))
         increment.append(SquaredError.between(position[1:], position[:-1], normal))
@@ -78,6 +85,8 @@ def measure(dataset: Dataset) -> DataScales:
         constants.append({key: trajectory.attributes.get(name) for key, name in RECORDED.items()})
         room = min(room, dataset.info.domain_half_width - float(np.abs(position - center).max()))
         planar = planar and not scene.rest_position[:, 2].any() and not position[:, :, 2].any()
+    for doubt in (*hints(dataset.material.columns), *([refusal(doubts)] if doubts else ())):
+        warn(f"{dataset.path}: {doubt}")
     return DataScales(
         displacement=rmse_pooled(displacement),
         increment=rmse_pooled(increment),

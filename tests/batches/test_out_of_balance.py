@@ -77,10 +77,9 @@ def test_numbers_of_the_material_are_found_by_name_among_columns_and_constants(m
     assert torch.equal(given.lame, expected.lame) and torch.equal(given.force, expected.force)
 
 
-@pytest.mark.parametrize("wrong", [0.5, -0.1])
-def test_a_ratio_that_no_material_has_is_not_taken(wrong):
+def test_a_ratio_that_the_solver_has_not_is_not_taken():
     made = replace(scene(1), material=None)
-    found = ElasticTetrahedra.of(made, Material(constants={"young": YOUNG, "poisson": wrong}))
+    found = ElasticTetrahedra.of(made, Material(constants={"young": YOUNG, "poisson": -0.1}))
     assert torch.equal(found.lame, ElasticTetrahedra.of(made, Material()).lame)
 
 

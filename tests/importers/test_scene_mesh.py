@@ -173,6 +173,26 @@ def test_types_from_a_field_and_what_changes_them():
     assert np.array_equal(found.node_type, np.where(PLATE, np.where(clamped, HANDLE, NORMAL), OBSTACLE))
 
 
+def test_a_clamp_of_an_obstacle_is_told():
+    read = read_scene(with_fields(), obstacles=[1], clamps=["1:zmin", "0:xmin"])
+    assert [one for one in read.warnings if one.startswith("the clamp '1:zmin'")][0].endswith("moves as a whole")
+    assert not any("0:xmin" in one for one in read.warnings)
+
+
+def test_a_material_by_name_and_a_folder_are_refused_as_such(tmp_path):
+    with pytest.raises(
+        ConfigError, match="the material of body 0 is of the type dict; it must be a number or numbers, in"
+    ):
+        read_scene(with_fields(), materials={0: {"young": 2e5, "poisson": 0.3}}, **PRESCRIBED)
+    with pytest.raises(DatasetError, match="is a folder: name a file in it"):
+        read_scene(tmp_path)
+    fields = {"young": np.full(len(TETS), 1.0), "poisson": np.full(len(TETS), 0.7)}
+    with pytest.raises(
+        DatasetError, match="mesh: poisson of the material is 0.7 in element 0, and must be above -1 and"
+    ):
+        read_scene(with_fields(cell=fields), material_fields=("young", "poisson"), **PRESCRIBED)
+
+
 def test_bodies_from_fields():
     of_node, of_element = np.where(PLATE, 5, 2), np.where(np.arange(len(TETS)) < 768, 5, 2)
     for mesh, name in [

@@ -1,5 +1,6 @@
 """What is said against a question or an answer whose numbers look as good as others."""
 
+import re
 import warnings
 from dataclasses import replace
 
@@ -8,7 +9,9 @@ import pytest
 
 import ast_sim
 from ast_sim.inference.answering import doubts
-from ast_sim.support.errors import DatasetError
+from ast_sim.support.errors import DatasetError, RolloutError
+
+ROW = 97  # an element whose last corner can lie in the face of the others, so that no element before is flat
 
 
 @pytest.fixture(scope="module")
@@ -21,6 +24,16 @@ def plate():
     motion = np.repeat(scene.rest_position[None], 2, axis=0)
     motion[1, scene.node_type == ast_sim.NodeType.OBSTACLE] -= np.float32([0, 0, 0.03])
     return scene, motion
+
+
+@pytest.fixture(scope="module")
+def held(plate):
+    """The same; the ends of the plate are held, and the punch is an obstacle."""
+    scene, motion = plate
+    types = np.where(np.abs(scene.rest_position[:, 0]) > 0.239, 3, scene.body).astype(np.uint8)
+    motion = np.repeat(motion[:1], 2, axis=0)
+    motion[1, scene.body == 1] -= np.float32([0, 0, 0.02])
+    return replace(scene, node_type=types), motion
 
 
 def told(scene, motion):
@@ -51,6 +64,83 @@ def test_elements_that_are_numbered_inside_out_are_not_turned_over(plate):
     numbered = replace(scene, elements=scene.elements[:, [0, 1, 3, 2]])
     answer, lines = told(numbered, motion)
     assert answer.check().turned_over.value == 0 and not any("turned over" in line for line in lines)
+
+
+@pytest.mark.parametrize("share", [0.4, 1.0])
+def test_newton_steps_do_not_mind_how_elements_are_numbered(held, share):
+    scene, motion = held
+    turned = np.random.default_rng(0).random(scene.num_elements) < share
+    numbered = replace(scene, elements=np.where(turned[:, None], scene.elements[:, [0, 1, 3, 2]], scene.elements))
+    run, effort = ast_sim.example_run("plates"), ast_sim.Effort(newton_steps=2)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        one, other = (run.predict(each, motion, effort=effort) for each in (scene, numbered))
+    assert np.array_equal(one.position, other.position) and np.array_equal(one.reaction(), other.reaction())
+    assert other.check().residual.value == one.check().residual.value > 0
+    assert not any("lie on each other" in str(line.message) for line in caught)
+
+
+def test_a_mesh_that_folds_over_itself_is_told_and_has_no_newton_steps(held):
+    scene, motion = held
+    position = scene.rest_position.copy()
+    corner = scene.elements[ROW]
+    position[corner[3]] = 2 * position[corner[:3]].mean(axis=0) - position[corner[3]]
+    folded = replace(scene, rest_position=position)
+    count = len(folded.elements[folded.rest_volumes < 0])
+    assert 0 < count < 20
+    answer, lines = told(folded, motion)
+    assert sum("the mesh folds over itself there, so it cannot be computed with" in line for line in lines) == 1
+    assert answer.expected_error is None
+    with pytest.raises(RolloutError, match="a Newton step failed: .* elements that lie on each other"):
+        ast_sim.example_run("plates").predict(folded, motion, effort=ast_sim.Effort(newton_steps=1))
+
+
+@pytest.mark.parametrize("body", ["deforming", "rigid"])
+def test_elements_without_a_volume_are_refused_unless_they_are_rigid(held, body):
+    scene, motion = held
+    row = np.flatnonzero(scene.rigid_elements)[0] if body == "rigid" else ROW
+    position = scene.rest_position.copy()
+    position[scene.elements[row, 3]] = position[scene.elements[row, :3]].mean(axis=0)
+    flat = replace(scene, rest_position=position)
+    if body == "rigid":
+        flat.require_predictable("scene")
+        return
+    nodes = re.escape(str(scene.elements[row].tolist()))
+    text = f"scene: element {row} with the nodes {nodes} has no volume; \\d of {(~scene.rigid_elements).sum()} elements"
+    with pytest.raises(DatasetError, match=text):
+        told(flat, motion)
+
+
+def test_bodies_that_overlap_at_rest_are_told_as_of_files(held):
+    """Once each question; the same body twice is all overlap."""
+    scene, motion = held
+    inside = scene.rest_position - np.float32([0, 0, 0.033]) * (scene.body == 1)[:, None]
+    overlapping = replace(scene, rest_position=inside)
+    answer, lines = told(overlapping, motion - np.float32([0, 0, 0.033]) * (scene.body == 1)[:, None])
+    told_of = [line for line in lines if "pairs of bodies that overlap" in line]
+    assert len(told_of) == 1 and "body 1 lies 0.025 inside body 0 at the start" in told_of[0]
+    assert answer.expected_error is None and not any("overlap" in line for line in told(scene, motion)[1])
+    path = ast_sim.read_scene(overlapping.to_meshio())
+    assert [f"scene: {line}" for line in path.warnings] == told_of
+    twice = ast_sim.Scene.join(scene, scene)
+    lines = told(twice, np.concatenate([motion, motion], axis=1))[1]
+    assert any("body 2 stands where body 0 stands at the start; scenes that" in line for line in lines)
+
+
+def test_overlaps_are_looked_for_once_in_a_scene(held, monkeypatch):
+    scene, motion = held
+    scene, looked = replace(scene), []
+    monkeypatch.setattr("ast_sim.inference.predict_arguments.no_scene", lambda one: looked.append(one) or [])
+    ast_sim.example_run("plates").predict_motions(scene, [motion, motion], effort=ast_sim.Effort())
+    assert looked == [scene]
+
+
+def test_points_that_rounding_puts_at_one_place_are_told():
+    with pytest.warns(UserWarning, match="scene: rounding to float32 moves points by up to 0.001, and the shortest ed"):
+        ast_sim.box((1e9, 0, 0), (1e9 + 1e-3, 1, 1), cells=(4, 1, 1))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        ast_sim.box((1e3, 0, 0), (1e3 + 1, 1, 1), cells=(4, 1, 1))
 
 
 def test_a_scene_so_flat_that_its_answer_turns_over_is_told(plate):

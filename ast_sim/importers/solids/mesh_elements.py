@@ -9,17 +9,14 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
+from ast_sim.element_topology import turned_over
 from ast_sim.importers.formats.source_mesh import SourceMesh
-from ast_sim.importers.solids.middles import NO_NODE, TURNED, middles_of, require_near
+from ast_sim.importers.solids.middles import NO_NODE, middles_of, require_near
 from ast_sim.importers.solids.splitting import tetrahedra_of, triangles_of
 from ast_sim.support.errors import DatasetError, counted
-
-# A tetrahedron (triangle) is flat if its volume (area) is below this share of its longest edge to the power of 3 (2).
-_FLAT = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,8 +92,7 @@ def elements_of(mesh: SourceMesh, point_of: np.ndarray, corners: bool = False) -
     if second:
         require_near(mesh, elements, middle, row)
     turned, more = _turned_over(mesh, elements, row, starts)
-    elements[turned] = elements[turned][:, [0, 1, 3, 2]]
-    middle[turned] = middle[turned][:, TURNED]
+    elements, middle = turned_over(elements, turned), turned_over(middle, turned)
     mirrored = bool(turned.all()) and all(mesh.blocks[index].shape != "wedge" for index in chosen)
     return Elements(elements, middle if second else None, row, chosen, [*said, *more], mirrored)
 
@@ -127,30 +123,6 @@ def _require_proper(mesh: SourceMesh, cells: np.ndarray, rows: np.ndarray) -> No
     if repeated.any():
         first = int(np.argmax(repeated))
         raise DatasetError(f"{mesh.path}: element {rows[first]} refers to a node twice: {cells[first].tolist()}")
-
-
-def require_extent(path: Path, points: np.ndarray, elements: np.ndarray) -> None:
-    """Check that elements [E, 3, 4 or 10] are not flat.
-
-    Raises:
-        DatasetError: one is; the text names the file and the element.
-    """
-    corners = points[elements[:, :4]]
-    edges = corners[:, 1:] - corners[:, :1]
-    longest = np.linalg.norm(corners[:, :, None] - corners[:, None], axis=-1).max(axis=(1, 2))
-    if edges.shape[1] == 3:
-        size = np.linalg.det(edges) / 6
-        kind = "volume"
-    else:
-        size = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) / 2
-        kind = "area"
-    flat = np.abs(size) <= _FLAT * longest ** edges.shape[1]
-    if flat.any():
-        row = int(np.argmax(flat))
-        raise DatasetError(
-            f"{path}: element {row} with the nodes {elements[row].tolist()} has no {kind}; {flat.sum()} of"
-            f" {counted(len(flat), 'element has', 'elements have')} none: repair the mesh"
-        )
 
 
 def _turned_over(

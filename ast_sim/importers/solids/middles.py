@@ -12,9 +12,6 @@ from ast_sim.element_topology import MIDDLES
 from ast_sim.importers.formats.source_mesh import CellBlock, SourceMesh
 from ast_sim.support.errors import DatasetError
 
-# Where the middles of a tetrahedron stand after its corners 2 and 3 have changed places.
-TURNED = (0, 4, 3, 2, 1, 5)
-
 NO_NODE = -1
 
 # The middle of an edge lies within this share of its length around the point halfway.

@@ -17,9 +17,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from ast_sim.element_topology import MIDDLES, POINTS, SLOPES
+from ast_sim.element_topology import MIDDLES, POINTS, SLOPES, turned_over
 from ast_sim.mechanics.elements.elasticity import Deformation, Elasticity, stiffness
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean, cofactor, determinant, von_mises
+from ast_sim.plausibility.topology import folds
+from ast_sim.scene import Scene
 from ast_sim.support.errors import SimulationError
 
 LARGEST = 20.0
@@ -187,3 +189,21 @@ class SecondOrder(Elasticity):
 def elastic_body(rest: np.ndarray, elements: np.ndarray, material: NeoHookean) -> Elasticity:
     """The elastic body of tetrahedra [E,k] with k = 4 or 10 nodes and rest positions [N,3]; errors as its class."""
     return (Elasticity if elements.shape[1] == 4 else SecondOrder)(rest, elements, material)
+
+
+def deforming_body(scene: Scene, rows: np.ndarray, material: NeoHookean) -> Elasticity:
+    """The elastic body of the elements `rows` [E] of a scene. Tetrahedra that are numbered inside out are turned over.
+
+    Args:
+        material: of all elements of the scene.
+
+    Raises:
+        SimulationError: the mesh folds over itself, an element has no volume, or as the class of the body.
+    """
+    elements = scene.elements[rows].astype(np.int64)
+    wrong = scene.rest_volumes[rows] < 0
+    if wrong.any():
+        for fold in folds(scene):
+            raise SimulationError(str(fold))
+        elements = turned_over(elements, wrong)
+    return elastic_body(scene.rest_position.astype(np.float64), elements, material.of(rows))

@@ -30,7 +30,7 @@ import numpy as np
 
 from ast_sim.mechanics.elements.elasticity import Deformation, upright
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean
-from ast_sim.mechanics.elements.second_order import elastic_body
+from ast_sim.mechanics.elements.second_order import deforming_body
 from ast_sim.mechanics.linear_algebra.compliance import Compliance, compliance_of
 from ast_sim.mechanics.linear_algebra.linear_system import LinearSystem
 from ast_sim.mechanics.linearised.near_pairs import NearPairs, NearSurfaces
@@ -70,17 +70,16 @@ class NewtonSteps:
         watch: is called now and then in a step, with how many forces of contact it knows. It may raise to stop.
 
     Raises:
-        SimulationError: the rest volume of an element is not positive.
+        SimulationError: as `deforming_body`.
     """
 
     def __init__(self, scene: Scene, material: NeoHookean, clearance: float, friction: float = 0.0) -> None:
         self._scene, self._clearance, self._friction = scene, clearance, friction
         self._rest = scene.rest_position.astype(np.float64)
         self._deforming = np.flatnonzero(~scene.rigid_elements)
-        elements = scene.elements[self._deforming].astype(np.int64)
-        self.elasticity = elastic_body(self._rest, elements, material.of(self._deforming))
+        self.elasticity = deforming_body(scene, self._deforming, material)
         held = np.ones(scene.num_nodes, bool)
-        held[elements] = False
+        held[self.elasticity.elements] = False
         held |= scene.prescribed
         self.system = LinearSystem(self.elasticity.entries(), held)
         self.surfaces = NearSurfaces(scene, self.system.free)

@@ -25,7 +25,7 @@ from ast_sim.mechanics.case import SolidCase
 from ast_sim.mechanics.contact_and_friction import Contact
 from ast_sim.mechanics.elements.elasticity import Elasticity
 from ast_sim.mechanics.elements.neo_hookean import von_mises
-from ast_sim.mechanics.elements.second_order import elastic_body
+from ast_sim.mechanics.elements.second_order import deforming_body
 from ast_sim.named_field import REACTION, NamedField
 from ast_sim.scene import AttributeValue, Trajectory
 from ast_sim.simulate.calculix.ccx_results import Results, read_results
@@ -292,8 +292,7 @@ def _check(case: SolidCase, position: np.ndarray) -> tuple[list[float], str]:
 def _elasticity(case: SolidCase) -> Elasticity:
     """The deforming bodies."""
     scene = case.scene
-    soft = ~scene.rigid_elements
-    return elastic_body(scene.rest_position.astype(np.float64), scene.elements[soft], case.material.of(soft))
+    return deforming_body(scene, np.flatnonzero(~scene.rigid_elements), case.material)
 
 
 def _stress_arrays(case: SolidCase, stress: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:

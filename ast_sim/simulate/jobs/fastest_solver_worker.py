@@ -24,7 +24,7 @@ import numpy as np
 from ast_sim.dataset.reader import Dataset
 from ast_sim.mechanics.case import Drawn, SolidCase
 from ast_sim.mechanics.driven import Driven
-from ast_sim.mechanics.elements.second_order import elastic_body
+from ast_sim.mechanics.elements.second_order import deforming_body
 from ast_sim.mechanics.equilibria import Equilibria
 from ast_sim.mechanics.linearised.linearised_contact import CLEARANCE, NewtonSteps
 from ast_sim.mechanics.quasi_static import OneFrame, solve_frame
@@ -310,8 +310,7 @@ class _Loads:
             scene, Driven.of(scene, case.prescribed_position), case.material, case.contact_forces()
         )
         soft = np.flatnonzero(~scene.rigid_elements)
-        rest = scene.rest_position.astype(np.float64)
-        self._elasticity = elastic_body(rest, scene.elements[soft].astype(np.int64), case.material.of(soft))
+        self._elasticity = deforming_body(scene, soft, case.material)
         self._location = case.stress_location
         rows = scene.deforming(case.stress_location)
         self._rows = rows if case.stress_location == "node" else rows[soft]

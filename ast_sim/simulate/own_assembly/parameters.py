@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from ast_sim.material import impossible, possible
 from ast_sim.simulate.own_assembly.expressions import Expression, expression
 from ast_sim.support.errors import ConfigError, nearest_name
 
@@ -157,7 +158,17 @@ def completed(parameters: Mapping[str, Parameter], given: Mapping[str, Any]) -> 
             values[name] = one.middle
         else:
             values[name] = one.formula(values)
+        if not one.choices:
+            require_solvable(name, values[name])
     return values
+
+
+def require_solvable(name: str, *values: Any) -> None:
+    """Raise ConfigError if a number of a material, `PART.QUANTITY`, is one that the solver cannot take."""
+    part, _, quantity = name.rpartition(".")
+    if part and impossible(quantity, values, solved=True).any():
+        shown = " to ".join(f"{value:g}" for value in values)
+        raise ConfigError(f"{name} is {shown}; must be {possible(quantity, solved=True)}")
 
 
 def flattened(given: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:

@@ -21,7 +21,7 @@ from ast_sim.simulate.own_assembly.assembly_spec import (
     PartSpec,
 )
 from ast_sim.simulate.own_assembly.expressions import FUNCTIONS, Expression
-from ast_sim.simulate.own_assembly.parameters import Parameter, parameter, plain
+from ast_sim.simulate.own_assembly.parameters import Parameter, parameter, plain, require_solvable
 from ast_sim.simulate.own_assembly.spec_table import Table, VectorExpression
 from ast_sim.support.argument_checks import file_name
 from ast_sim.support.disk import read_text
@@ -198,10 +198,8 @@ def _solid(table: Table) -> str | int | None:
 
 def _add_material(parameters: dict[str, Parameter], name: str, given: Any, free: dict[str, Parameter]) -> None:
     made = parameter(name, given, free)
-    limit = 0.5 if name.endswith("poisson") else float("inf")
-    if made.formula is None and not (made.low >= 0 and made.high < limit and (limit == 0.5 or made.low > 0)):
-        wanted = "at least 0 and below 0.5" if limit == 0.5 else "above 0 (pascal)"
-        raise ConfigError(f"{name} is {made.low:g} to {made.high:g}; must be {wanted}")
+    if made.formula is None:
+        require_solvable(name, made.low, made.high)
     parameters[name] = made
 
 

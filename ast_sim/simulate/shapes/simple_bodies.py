@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from ast_sim.number_arrays import real_numbers, three_numbers
+from ast_sim.number_arrays import connected_parts, real_numbers, three_numbers
 from ast_sim.scene import Scene
 from ast_sim.simulate.shapes import mesh
 from ast_sim.support.argument_checks import in_short, several
-from ast_sim.support.errors import ConfigError
+from ast_sim.support.errors import ConfigError, warn
 
 MOST_CELLS = 10_000_000
 
@@ -47,7 +47,7 @@ def plate(size: Sequence[float], cells: Sequence[int], holes: Sequence[Sequence[
         arrays: other arguments of `Scene.of`.
 
     Raises:
-        ConfigError: a size or a number of cells is not above 0, or a hole leaves out no cell.
+        ConfigError: a size or a number of cells is not above 0, a hole leaves out no cell, or they leave none.
         DatasetError: these are no numbers, or not three where three are needed.
     """
     lengths = three_numbers("the plate", "size", size)
@@ -57,7 +57,13 @@ def plate(size: Sequence[float], cells: Sequence[int], holes: Sequence[Sequence[
         raise ConfigError("the holes of the plate must be triples: centre x, centre y and a radius above 0")
     for hole in cut.reshape(-1, 3):
         _require_cut(lengths, cells, hole)
-    return Scene.of(*mesh.plate(lengths.tolist(), cells, cut.reshape(-1, 3)), **arrays)
+    nodes, elements = mesh.plate(lengths.tolist(), cells, cut.reshape(-1, 3))
+    if not len(elements):
+        raise ConfigError("the holes leave no cell of the plate: make them smaller, or move them")
+    pieces = 1 + int(connected_parts(elements, len(nodes)).max())
+    if pieces > 1:
+        warn(f"the holes cut the plate into {pieces} pieces, each a body of its own: make them smaller, or move them")
+    return Scene.of(nodes, elements, **arrays)
 
 
 def _require_cut(size: np.ndarray, cells: Sequence[int], hole: np.ndarray) -> None:
@@ -123,7 +129,8 @@ def _above_zero(what: str, sizes: Sequence[float] | np.ndarray, cells: Sequence[
     if not whole or len(counts) != (1 if even else 3) or (even and counts[0] % 2):
         needs = "an even whole number" if even else "three whole numbers"
         raise ConfigError(f"{what} has {counts} cells; must be {needs} above 0")
-    if math.prod(map(int, counts)) > MOST_CELLS:
-        told = " x ".join(map(in_short, counts))
+    along = 3 * counts if even else counts
+    if math.prod(map(int, along)) > MOST_CELLS:
+        told = " x ".join(map(in_short, along))
         raise ConfigError(f"{what} has {told} cells; more than {MOST_CELLS:,} are too many for one scene")
     return counts
