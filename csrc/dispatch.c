@@ -64,18 +64,18 @@ const ast_kernels *ast_select(const char *name) {
 /* Intel's processors do half as many operations a second by dot products of bfloat16 as in float32, AMD's twice as
  * many (docs/log.md). */
 #define HAS_avx512_bf16 (HAS_avx512 && HAS("avx512bf16") && __builtin_cpu_is("amd"))
-#define HAS_amx         (HAS_avx512 && HAS("avx512bf16") && may_use_tiles())
+#define HAS_amx         (HAS_avx512 && HAS("avx512bf16") && dispatch_may_use_tiles())
 
 #if defined(AST_HAVE_AMX) && defined(__linux__)
 /* Tiles take 8 KB of state, so a process has to ask the kernel for them. */
-static bool may_use_tiles(void) {
+static bool dispatch_may_use_tiles(void) {
   enum { REQUEST = 0x1023, TILE_DATA = 18, AMX_BF16 = 1 << 22, AMX_TILE = 1 << 24 };
   unsigned a, b, c, d;
   if (!__get_cpuid_count(7, 0, &a, &b, &c, &d) || !(d & AMX_BF16) || !(d & AMX_TILE)) return false;
   return syscall(SYS_arch_prctl, REQUEST, TILE_DATA) == 0;
 }
 #elif defined(AST_HAVE_AMX)
-static bool may_use_tiles(void) { return false; }
+static bool dispatch_may_use_tiles(void) { return false; }
 #endif
 
 const ast_kernels *ast_bfloat16(int i) {

@@ -44,14 +44,14 @@ static pthread_key_t key;
 static pthread_once_t once = PTHREAD_ONCE_INIT;
 static int key_status;
 
-static char *begin_of(block *b) { return (char *)b + ALIGNMENT; }
-static int64_t room_of(block *b) { return b ? b->end - begin_of(b) : -1; }
+static char *memory_begin(block *b) { return (char *)b + ALIGNMENT; }
+static int64_t memory_room(block *b) { return b ? b->end - memory_begin(b) : -1; }
 
-static void pop(stack *s) {
+static void memory_pop(stack *s) {
   block *b = s->newest;
-  s->used -= b->next - begin_of(b);
+  s->used -= b->next - memory_begin(b);
   s->newest = b->below;
-  if (!APART && room_of(b) > room_of(s->spare)) {
+  if (!APART && memory_room(b) > memory_room(s->spare)) {
     free(s->spare);
     s->spare = b;
   } else {
@@ -59,38 +59,38 @@ static void pop(stack *s) {
   }
 }
 
-static bool push(stack *s, int64_t bytes) {
+static bool memory_push(stack *s, int64_t bytes) {
   block *b = s->spare;
-  if (room_of(b) >= bytes) {
+  if (memory_room(b) >= bytes) {
     s->spare = NULL;
   } else {
     const int64_t room = s->newest || APART || s->most < bytes ? bytes : s->most;
     b = aligned_alloc(ALIGNMENT, (size_t)(ALIGNMENT + room));
     if (!b) return false;
-    b->end = begin_of(b) + room;
+    b->end = memory_begin(b) + room;
   }
   b->below = s->newest;
-  b->next = begin_of(b);
+  b->next = memory_begin(b);
   s->newest = b;
   return true;
 }
 
-static void free_stack(void *p) {
+static void memory_free_stack(void *p) {
   stack *s = p;
-  while (s->newest) pop(s);
+  while (s->newest) memory_pop(s);
   free(s->spare);
   free(s);
 }
 
-static void create_key(void) { key_status = pthread_key_create(&key, free_stack); }
+static void memory_create_key(void) { key_status = pthread_key_create(&key, memory_free_stack); }
 
 /* The stack of the calling thread; NULL if it has none yet. */
-static stack *own_stack(void) {
-  pthread_once(&once, create_key);
+static stack *memory_own_stack(void) {
+  pthread_once(&once, memory_create_key);
   return key_status ? NULL : pthread_getspecific(key);
 }
 
-static stack *new_stack(void) {
+static stack *memory_new_stack(void) {
   stack *s = key_status ? NULL : calloc(1, sizeof *s);
   if (s && !pthread_setspecific(key, s)) return s;
   free(s);
@@ -98,10 +98,10 @@ static stack *new_stack(void) {
 }
 
 void *ast_scratch(int64_t bytes) {
-  stack *s = own_stack();
-  if (!s && !(s = new_stack())) return NULL;
+  stack *s = memory_own_stack();
+  if (!s && !(s = memory_new_stack())) return NULL;
   const int64_t size = (bytes / ALIGNMENT + 1) * ALIGNMENT; /* never 0, so that no two requests give the same mark */
-  if ((!s->newest || APART || s->newest->end - s->newest->next < size) && !push(s, size)) return NULL;
+  if ((!s->newest || APART || s->newest->end - s->newest->next < size) && !memory_push(s, size)) return NULL;
   void *const data = s->newest->next;
   s->newest->next += size;
   s->used += size;
@@ -110,19 +110,19 @@ void *ast_scratch(int64_t bytes) {
 }
 
 void *ast_scratch_mark(void) {
-  const stack *s = own_stack();
+  const stack *s = memory_own_stack();
   return s && s->newest ? s->newest->next : NULL;
 }
 
 /* A mark is the end of a request, where no block but its own reaches, or NULL for the empty stack. */
 void ast_scratch_release(void *mark) {
-  stack *s = own_stack();
+  stack *s = memory_own_stack();
   if (!s || !s->newest) return;
-  while (s->newest && (s->newest->next < (char *)mark || (char *)mark <= begin_of(s->newest))) pop(s);
+  while (s->newest && (s->newest->next < (char *)mark || (char *)mark <= memory_begin(s->newest))) memory_pop(s);
   if (s->newest) {
     s->used -= s->newest->next - (char *)mark;
     s->newest->next = mark;
-  } else if (s->most > SCRATCH_KEPT || room_of(s->spare) < s->most) {
+  } else if (s->most > SCRATCH_KEPT || memory_room(s->spare) < s->most) {
     free(s->spare);
     s->spare = NULL;
     if (s->most > SCRATCH_KEPT) s->most = 0;

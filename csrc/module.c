@@ -4,7 +4,7 @@
 
 /* ---- kernels ---- */
 
-static PyObject *call_kernel(PyObject *self, PyObject *const *objects, Py_ssize_t num) {
+static PyObject *module_call_kernel(PyObject *self, PyObject *const *objects, Py_ssize_t num) {
   const binding *b = PyCapsule_GetPointer(self, NULL);
   if (!b) return NULL;
   call c = {.spec = &b->spec};
@@ -21,14 +21,14 @@ static PyObject *call_kernel(PyObject *self, PyObject *const *objects, Py_ssize_
 }
 
 /* Whether this is something that a kernel reads as indices in place. */
-static bool take_indices(PyObject *object, view *v, argument *a) {
+static bool module_take_indices(PyObject *object, view *v, argument *a) {
   static const parameter dense;
   return view_of(object, v) && v->type == INTS && v->ndim >= 1 && v->ndim <= MAX_SHAPE && take_layout(&dense, v, a) &&
          a->bytes;
 }
 
 /* A new array with these values, which kernels trust from now on (frozen.h). */
-static PyObject *frozen_copy(const view *v, const argument *a) {
+static PyObject *module_frozen_copy(const view *v, const argument *a) {
   frozen *f = new_frozen(a->bytes);
   if (!f) return NULL;
   memcpy(f->shown, a->data, (size_t)a->bytes);
@@ -36,28 +36,28 @@ static PyObject *frozen_copy(const view *v, const argument *a) {
 }
 
 /* The same object if there is nothing to do: it is frozen already, or no indices. */
-static PyObject *freeze_one(PyObject *object) {
+static PyObject *module_freeze_one(PyObject *object) {
   view v;
   argument a;
-  if (take_indices(object, &v, &a) && !find_frozen(a.data, a.bytes)) return frozen_copy(&v, &a);
+  if (module_take_indices(object, &v, &a) && !find_frozen(a.data, a.bytes)) return module_frozen_copy(&v, &a);
   return Py_INCREF(object), object;
 }
 
 /* The same object if it is not frozen, or if what it shows is what kernels read. */
-static PyObject *read_one(PyObject *object) {
+static PyObject *module_read_one(PyObject *object) {
   view v;
   argument a;
-  if (!take_indices(object, &v, &a) || !find_frozen(a.data, a.bytes)) return Py_INCREF(object), object;
+  if (!module_take_indices(object, &v, &a) || !find_frozen(a.data, a.bytes)) return Py_INCREF(object), object;
   PyObject *values = NULL;
   if (secure(&a)) {
-    if (memcmp(a.data, a.frozen->shown, (size_t)a.bytes)) values = frozen_copy(&v, &a);
+    if (memcmp(a.data, a.frozen->shown, (size_t)a.bytes)) values = module_frozen_copy(&v, &a);
     else Py_INCREF(values = object);
   }
   Py_DECREF(a.frozen->owner);
   return values;
 }
 
-static PyObject *of_each(PyObject *const *objects, Py_ssize_t num, PyObject *(*of)(PyObject *)) {
+static PyObject *module_of_each(PyObject *const *objects, Py_ssize_t num, PyObject *(*of)(PyObject *)) {
   PyObject *tuple = PyTuple_New(num);
   for (Py_ssize_t i = 0; tuple && i < num; i++) {
     PyObject *object = of(objects[i]);
@@ -66,21 +66,21 @@ static PyObject *of_each(PyObject *const *objects, Py_ssize_t num, PyObject *(*o
   return tuple;
 }
 
-static PyObject *freeze(PyObject *self, PyObject *const *objects, Py_ssize_t num) {
+static PyObject *module_freeze(PyObject *self, PyObject *const *objects, Py_ssize_t num) {
   (void)self;
-  return of_each(objects, num, freeze_one);
+  return module_of_each(objects, num, module_freeze_one);
 }
 
-static PyObject *values_read(PyObject *self, PyObject *const *objects, Py_ssize_t num) {
+static PyObject *module_values_read(PyObject *self, PyObject *const *objects, Py_ssize_t num) {
   (void)self;
-  return of_each(objects, num, read_one);
+  return module_of_each(objects, num, module_read_one);
 }
 
 static PyMethodDef kernel_methods[sizeof bindings / sizeof *bindings];
 
 /* declare(name, names, numbers) adds the function of a kernel to the module: the names of the parameters that the call
  * of the kernel reads, "x, weight, out", and the numbers of its spec. */
-static PyObject *declare(PyObject *module, PyObject *arguments) {
+static PyObject *module_declare(PyObject *module, PyObject *arguments) {
   const char *name, *names, *numbers;
   Py_ssize_t bytes;
   if (!PyArg_ParseTuple(arguments, "ssy#", &name, &names, &numbers, &bytes)) return NULL;
@@ -90,7 +90,7 @@ static PyObject *declare(PyObject *module, PyObject *arguments) {
   spec *s = &bindings[i].spec;
   if (!read_spec(s, names, numbers, bytes))
     return PyErr_Format(PyExc_ValueError, "declare: %s takes (%s), its spec says something else", name, s->names);
-  kernel_methods[i] = (PyMethodDef){s->name, (PyCFunction)(void (*)(void))call_kernel, METH_FASTCALL, s->names};
+  kernel_methods[i] = (PyMethodDef){s->name, (PyCFunction)(void (*)(void))module_call_kernel, METH_FASTCALL, s->names};
   PyObject *self = PyCapsule_New(&bindings[i], NULL, NULL);
   PyObject *function = self ? PyCFunction_NewEx(&kernel_methods[i], self, NULL) : NULL;
   const bool added = function && PyObject_SetAttrString(module, name, function) == 0;
@@ -107,7 +107,7 @@ static const char *const stiffness_names[STIFFNESS_ARRAYS] = {"entries", "F", "g
                                                               "mu",      "c", "spread"};
 
 /* Whether the arrays fit together: those before STIFFNESS_TABLES end in the axis of the elements or points. */
-static bool take_stiffness(PyObject *const *objects, Py_buffer *arrays, int *taken, ast_stiffness *s) {
+static bool module_take_stiffness(PyObject *const *objects, Py_buffer *arrays, int *taken, ast_stiffness *s) {
   for (; *taken < STIFFNESS_ARRAYS; ++*taken) {
     Py_buffer *a = &arrays[*taken];
     const int writable = *taken ? 0 : PyBUF_WRITABLE;
@@ -136,7 +136,7 @@ static bool take_stiffness(PyObject *const *objects, Py_buffer *arrays, int *tak
 }
 
 /* elastic_stiffness(entries, F, gradients, volume, mu, c, spread, project) writes entries; whether all are known. */
-static PyObject *elastic_stiffness(PyObject *self, PyObject *const *objects, Py_ssize_t num) {
+static PyObject *module_elastic_stiffness(PyObject *self, PyObject *const *objects, Py_ssize_t num) {
   (void)self;
   if (num != STIFFNESS_ARRAYS + 1)
     return PyErr_Format(PyExc_TypeError, "elastic_stiffness takes %d arguments, not %zd", STIFFNESS_ARRAYS + 1, num);
@@ -146,7 +146,7 @@ static PyObject *elastic_stiffness(PyObject *self, PyObject *const *objects, Py_
   int taken = 0;
   ast_stiffness s;
   ast_status status = AST_OK;
-  const bool fits = take_stiffness(objects, arrays, &taken, &s);
+  const bool fits = module_take_stiffness(objects, arrays, &taken, &s);
   if (fits) {
     s.project = project;
     Py_BEGIN_ALLOW_THREADS status = float32_kernels->elastic_stiffness(&s, arrays[0].buf);
@@ -159,7 +159,7 @@ static PyObject *elastic_stiffness(PyObject *self, PyObject *const *objects, Py_
 /* ---- the process ---- */
 
 /* The addresses of torch_parallel_for and torch_get_num_threads. */
-static PyObject *set_pool(PyObject *self, PyObject *arguments) {
+static PyObject *module_set_pool(PyObject *self, PyObject *arguments) {
   (void)self;
   unsigned long long parallel_for, num_threads;
   if (!PyArg_ParseTuple(arguments, "KK", &parallel_for, &num_threads)) return NULL;
@@ -167,12 +167,12 @@ static PyObject *set_pool(PyObject *self, PyObject *arguments) {
   Py_RETURN_NONE;
 }
 
-static PyObject *keep_memory(PyObject *self, PyObject *unused) {
+static PyObject *module_keep_memory(PyObject *self, PyObject *unused) {
   (void)self, (void)unused;
   return PyBool_FromLong(ast_keep_memory());
 }
 
-static PyObject *configuration(PyObject *self, PyObject *unused) {
+static PyObject *module_configuration(PyObject *self, PyObject *unused) {
   (void)self, (void)unused;
   PyObject *supported = PyList_New(0);
   for (int i = 0; supported && ast_supported(i); i++) {
@@ -186,7 +186,7 @@ static PyObject *configuration(PyObject *self, PyObject *unused) {
 }
 
 /* Whether products were in bfloat16 so far. */
-static PyObject *multiply_in_bfloat16(PyObject *self, PyObject *wanted) {
+static PyObject *module_multiply_in_bfloat16(PyObject *self, PyObject *wanted) {
   (void)self;
   const int on = PyObject_IsTrue(wanted);
   if (on < 0) return NULL;
@@ -197,7 +197,7 @@ static PyObject *multiply_in_bfloat16(PyObject *self, PyObject *wanted) {
 }
 
 /* The float32 kernels; where another table has a kernel, it takes the place. */
-static void prepare_bfloat16(const ast_kernels *table) {
+static void module_prepare_bfloat16(const ast_kernels *table) {
   if (!table) return;
   bfloat16_kernels = *float32_kernels;
   bfloat16_kernels.isa = table->isa;
@@ -207,33 +207,33 @@ static void prepare_bfloat16(const ast_kernels *table) {
 }
 
 static PyMethodDef methods[] = {
-    {"declare", declare, METH_VARARGS,
+    {"declare", module_declare, METH_VARARGS,
      "declare(name, names, numbers): adds the kernel of this name, which takes what the numbers of its spec say."},
-    {"freeze", (PyCFunction)(void (*)(void))freeze, METH_FASTCALL,
+    {"freeze", (PyCFunction)(void (*)(void))module_freeze, METH_FASTCALL,
      "freeze(*indices): copies that kernels trust, or the arrays themselves if they are such."},
-    {"values_read", (PyCFunction)(void (*)(void))values_read, METH_FASTCALL,
+    {"values_read", (PyCFunction)(void (*)(void))module_values_read, METH_FASTCALL,
      "values_read(*objects): copies of what kernels read of frozen arrays that were written to since; else the same."},
-    {"elastic_stiffness", (PyCFunction)(void (*)(void))elastic_stiffness, METH_FASTCALL,
+    {"elastic_stiffness", (PyCFunction)(void (*)(void))module_elastic_stiffness, METH_FASTCALL,
      "elastic_stiffness(entries, F, gradients, volume, mu, c, spread, project): writes entries; whether all are "
      "known."},
-    {"set_pool", set_pool, METH_VARARGS,
+    {"set_pool", module_set_pool, METH_VARARGS,
      "set_pool(parallel_for, num_threads): addresses of torch's thread pool, 0 for serial."},
-    {"keep_memory", keep_memory, METH_NOARGS, "Let the C library keep freed blocks; whether it had an effect."},
-    {"configuration", configuration, METH_NOARGS,
+    {"keep_memory", module_keep_memory, METH_NOARGS, "Let the C library keep freed blocks; whether it had an effect."},
+    {"configuration", module_configuration, METH_NOARGS,
      "The chosen instruction set, the supported ones, the one for bfloat16 or None, the threads, the debug mode."},
-    {"multiply_in_bfloat16", multiply_in_bfloat16, METH_O,
+    {"multiply_in_bfloat16", module_multiply_in_bfloat16, METH_O,
      "multiply_in_bfloat16(wanted): how dense layers of this thread multiply from now on; whether they did so before."},
     {NULL, NULL, 0, NULL},
 };
 
-static int execute(PyObject *module) {
+static int module_execute(PyObject *module) {
   import_array1(-1);
   if (PyModule_AddStringConstant(module, "checks", check_names)) return -1;
   const char *wanted = getenv("AST_SIM_ISA"), *check = getenv("AST_SIM_DEBUG");
   debug = check && !strcmp(check, "1");
   float32_kernels = ast_select(wanted && *wanted ? wanted : NULL);
   if (float32_kernels) {
-    if (!wanted || !*wanted) prepare_bfloat16(ast_bfloat16(0));
+    if (!wanted || !*wanted) module_prepare_bfloat16(ast_bfloat16(0));
     return 0;
   }
   PyErr_Format(PyExc_ImportError,
@@ -242,7 +242,7 @@ static int execute(PyObject *module) {
   return -1;
 }
 
-static PyModuleDef_Slot slots[] = {{Py_mod_exec, execute}, {0, NULL}};
+static PyModuleDef_Slot slots[] = {{Py_mod_exec, module_execute}, {0, NULL}};
 
 static struct PyModuleDef definition = {
     .m_base = PyModuleDef_HEAD_INIT,

@@ -26,7 +26,7 @@ typedef struct {
   atomic_int_least64_t failed; /* (index << 8 | status) of the first failure by index, or INT64_MAX */
 } job;
 
-static void run(int64_t begin, int64_t end, void *context) {
+static void parallel_run(int64_t begin, int64_t end, void *context) {
   (void)begin, (void)end;
   job *j = context;
   void *const mark = ast_scratch_mark();
@@ -46,7 +46,8 @@ static void run(int64_t begin, int64_t end, void *context) {
 ast_status ast_parallel(int64_t tasks, ast_task task, void *context) {
   job j = {.tasks = tasks, .task = task, .context = context, .next = 0, .failed = INT64_MAX};
   const int64_t threads = ast_threads();
-  if (tasks < 2 || threads < 2 || pool_for(0, threads < tasks ? threads : tasks, 1, run, &j) != 0) run(0, 1, &j);
+  if (tasks < 2 || threads < 2 || pool_for(0, threads < tasks ? threads : tasks, 1, parallel_run, &j) != 0)
+    parallel_run(0, 1, &j);
   const int64_t failed = atomic_load(&j.failed);
   return failed == INT64_MAX ? AST_OK : (ast_status)(failed & 255);
 }

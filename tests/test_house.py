@@ -123,6 +123,26 @@ def test_modules_are_named_by_strings_only_where_a_test_looks():
     assert starting <= known, "resolve the module it names in the test above"
 
 
+def private_ops(source: str) -> list[str]:
+    """The private modules and names of `ops` that a module imports."""
+    names = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            names += [f"{node.module}.{alias.name}" for alias in node.names]
+        elif isinstance(node, ast.Import):
+            names += [alias.name for alias in node.names]
+    return [name for name in names if re.match(r"ast_sim\.ops\.(\w+\.)*_", name)]
+
+
+def test_nothing_outside_imports_a_private_module_of_ops():
+    """Import-linter has no wildcard for some modules of a package."""
+    for line in ("from ast_sim.ops import linear, _mlp", "from ast_sim.ops._mlp import mlp", "import ast_sim.ops._mlp"):
+        assert len(private_ops(line)) == 1, line
+    assert not private_ops("from ast_sim.ops.library import Op\nfrom ast_sim.models import _own")
+    outside = [path for path in MODULE_FILES if ROOT / "ops" not in path.parents]
+    assert len(outside) > 100 and not [path for path in outside if private_ops(path.read_text(encoding="utf-8"))]
+
+
 NO_NOUNS = {"found", "asked", "walked", "ways"}  # names that do not say what they hold
 MODULES_OF_NUMBERS = {"np", "torch", "math", "time", "nn", "igl", "ipctk"}
 
@@ -267,6 +287,35 @@ def test_lines_of_the_core_are_short():
     texts = {path.relative_to(REPOSITORY).as_posix(): path.read_text(encoding="utf-8") for path in sources}
     lines = ((path, *line) for path, text in texts.items() for line in enumerate(text.splitlines(), 1))
     assert not [f"{path}:{number}" for path, number, line in lines if len(line) > 120 or line.startswith("*")]
+
+
+# The prefix of the functions of a C file, where it is not the first word of the name of the file.
+C_FAMILIES = {
+    "attention_block": ("block",),
+    "coarsen": ("octree",),
+    "elastic_stiffness": ("stiffness",),
+    "pairs": ("octree",),
+    "segment": ("segment", "column"),
+    "sparse_conv": ("conv",),
+    "sparse_conv_weight": ("conv",),
+}
+C_FUNCTION = re.compile(r"^(?:static|AST_INLINE)\b[^;=\n]*?\b(\w+)\((?!\()", re.M)
+
+
+def without_prefix(stem: str, source: str) -> list[str]:
+    """The functions of a C file whose names do not say to which family they belong."""
+    families = C_FAMILIES.get(stem, (stem.split("_")[0],))
+    return [name for name in C_FUNCTION.findall(source) if name.split("_")[0] not in families]
+
+
+def test_functions_of_the_core_carry_the_prefix_of_their_family():
+    """All kernels are one translation unit, in which their names meet."""
+    source = "static void pop(stack *s) {\nAST_INLINE vf fps_near(vf x) {\nstatic char *fps_at(void) { f(g); }\n"
+    assert without_prefix("fps", source) == ["pop"]
+    kernels = set(re.findall(r"KERNEL\((\w+)\)", (REPOSITORY / "csrc" / "ast.h").read_text(encoding="utf-8")))
+    files = sorted((REPOSITORY / "csrc").glob("*.c"))
+    bad = {path.name: set(without_prefix(path.stem, path.read_text(encoding="utf-8"))) - kernels for path in files}
+    assert len(files) > 30 and not {name: functions for name, functions in bad.items() if functions}
 
 
 if __name__ == "__main__":
