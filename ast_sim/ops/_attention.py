@@ -207,15 +207,12 @@ def _check_block_heads(name: str, sizes: Sizes, given: Given) -> None:
 
 
 def rotated(x: Tensor, by: Tensor | None) -> Tensor:
-    """x [..., D] with each pair (x_2i, x_2i+1) multiplied by a complex number of `by` [..., D / 2]. None: x itself."""
+    """x [T, H, D] with each pair (x_2i, x_2i+1) turned by the angle whose cosine and sine are (by_2i, by_2i+1), `by`
+    [T, D]. None: x itself."""
     if by is None:
         return x
-    return torch.view_as_real(torch.view_as_complex(x.unflatten(-1, (-1, 2))) * by).flatten(-2)
-
-
-def _turned(x: Tensor, rotations: Tensor | None) -> Tensor:
-    """`rotated` [T, H, D] by cosines and sines [T, D]."""
-    return rotated(x, None if rotations is None else torch.view_as_complex(rotations.unflatten(1, (-1, 2)))[:, None])
+    (a, b), (cosine, sine) = (pairs.unflatten(-1, (-1, 2)).unbind(-1) for pairs in (x, by[:, None].to(x.dtype)))
+    return torch.stack([a * cosine - b * sine, b * cosine + a * sine], dim=-1).flatten(-2)
 
 
 def _block_reference(
@@ -225,7 +222,7 @@ def _block_reference(
     q = F.linear(layer_norm(x, gamma, beta), query).unflatten(1, (heads, -1))
     of_context = F.linear(layer_norm(context, context_gamma, context_beta), key_value)
     k, v = of_context.unflatten(1, (2, heads, -1)).unbind(1)
-    q, k = _turned(q, rotations), _turned(k, context_rotations)
+    q, k = rotated(q, rotations), rotated(k, context_rotations)
     mixed, maximum, total = _reference(q, k, v, q_offsets, k_offsets, q.shape[-1] ** -0.5, 0.0, 0)
     y = x + F.linear(mixed.flatten(1), weight, bias)
     z = F.linear(layer_norm(y, inner_gamma, inner_beta), first, first_bias)
@@ -281,4 +278,4 @@ def attention_block(
     ):
         return _block.compose(*given, False, False)[0]
     save = torch.is_grad_enabled() and any(y.requires_grad for y in (x, context, *parameters))
-    return _block(*given, save, save and is_at_most(len(x) * len(parameters[11]), SAVED))[0]
+    return _block(*given, save, save and is_at_most(x.shape[0] * parameters[11].shape[0], SAVED))[0]

@@ -120,12 +120,12 @@ class EdgeSet(IndexSet):
 
     @property
     def num_receivers(self) -> int:
-        return len(self.receiver_offsets) - 1
+        return self.receiver_offsets.shape[0] - 1
 
     @_kept
     def by_receiver(self) -> tuple[Tensor, ...]:
         """The edges in stored order, and the offsets of each receiver's edges, as segment ops take them."""
-        return *frozen(torch.arange(len(self), device=self.receivers.device)), self.receiver_offsets
+        return *frozen(torch.arange(self.receivers.shape[0], device=self.receivers.device)), self.receiver_offsets
 
     @_kept
     def by_sender(self) -> tuple[Tensor, ...]:

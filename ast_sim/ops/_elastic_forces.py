@@ -64,7 +64,7 @@ class TetrahedronSet(IndexSet):
 
     @property
     def num_nodes(self) -> int:
-        return len(self.node_offsets) - 1
+        return self.node_offsets.shape[0] - 1
 
     def __len__(self) -> int:
         return len(self.elements)

@@ -68,7 +68,7 @@ def _check_features(edges: EdgeSet, of_senders: Tensor, edge_features: Tensor | 
             raise ValueError("message: an encoder needs edge_features; give them together, or no encoder")
         if len(encoder[1]) == 0:
             raise ValueError("message: a1 is empty: an encoder needs hidden channels, or give none")
-    elif edge_features is not None and edge_features.shape != (len(edges), of_senders.shape[-1]):
+    elif edge_features is not None and edge_features.shape != (edges.senders.shape[0], of_senders.shape[-1]):
         wanted = f"[{len(edges)}, {of_senders.shape[-1]}]"
         shape = tuple(edge_features.shape)
         raise ValueError(f"message: edge_features without an encoder must have shape {wanted}, not {shape}")
@@ -79,7 +79,7 @@ def _of_edges(
 ) -> tuple[Tensor, ...]:
     """The edge features and the encoder as the op takes them: empty where there are none."""
     if edge_features is None:
-        edge_features = of_senders.new_empty(len(edges), 0)
+        edge_features = of_senders.new_empty(edges.senders.shape[0], 0)
     if encoder is not None:
         return edge_features, *encoder
     shapes = ((0, edge_features.shape[1]), (0,), (of_senders.shape[-1], 0))

@@ -100,7 +100,7 @@ def sparse_conv(x: Tensor, weight: Tensor, map: CellMap, bias: Tensor | None = N
     if x.shape[0] != map.num_fine:
         raise ValueError(f"sparse_conv: x has {counted(x.shape[0], 'row')} for {counted(map.num_fine, 'fine cell')}")
     pairs = (map.fine, map.coarse_index, map.coarse_by_fine, map.fine_by_fine)
-    return _conv(x, weight, bias, False, map.pair_offsets, *pairs, len(map.coarse.keys))
+    return _conv(x, weight, bias, False, map.pair_offsets, *pairs, map.coarse.keys.shape[0])
 
 
 def sparse_conv_transposed(x: Tensor, weight: Tensor, map: CellMap, bias: Tensor | None = None) -> Tensor:
@@ -118,7 +118,7 @@ def sparse_conv_transposed(x: Tensor, weight: Tensor, map: CellMap, bias: Tensor
     Raises:
         ValueError: shapes do not fit each other or the map.
     """
-    if x.shape[0] != len(map.coarse.keys):
+    if x.shape[0] != map.coarse.keys.shape[0]:
         raise ValueError(
             f"sparse_conv_transposed: x has {counted(x.shape[0], 'row')} for"
             f" {counted(len(map.coarse.keys), 'coarse cell')}"

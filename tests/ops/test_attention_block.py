@@ -67,6 +67,15 @@ def test_only_wanted_gradients_are_made():
         assert torch.equal(one, torch.autograd.grad(fused(*every).square().sum(), every[place])[0])
 
 
+def test_bfloat16_takes_the_composition():
+    """Rotations and all, whose numbers are read as they are."""
+    inputs = [x.bfloat16() if x.is_floating_point() else x for x in case([5, 6], [7, 8], 40, 24)]
+    out = fused(*inputs)
+    assert out.dtype == torch.bfloat16
+    exact = composed(*[x.double() if x.is_floating_point() else x for x in inputs])
+    assert (out - exact).abs().max() < 0.03 * exact.abs().max()
+
+
 def test_no_vectors():
     assert fused(*case([0], [2], 40, 24)).shape == (0, 40) and fused(*case([], [], 40, 24)).shape == (0, 40)
 

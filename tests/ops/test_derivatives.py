@@ -13,6 +13,7 @@ from ast_sim.ops import (
     EdgeSet,
     TetrahedronSet,
     attention,
+    attention_block,
     elastic_forces,
     farthest_point_sample,
     library,
@@ -31,6 +32,7 @@ from ast_sim.ops._segment import column_sum
 
 EDGES = EdgeSet.from_pairs(torch.tensor([0, 2, 1, 1, 3, 0, 2]), torch.tensor([1, 1, 0, 2, 2, 2, 4]), 4, 5)
 LAYERS = ((6, 5), (6,), (6,), (6,))  # W2, b2, gamma, beta
+BLOCK = ((6,), (6,), (5,), (5,), (16, 6), (32, 5), (6, 16), (6,), (6,), (6,), (8, 6), (8,), (6, 4), (6,))  # parameters
 SEGMENTS = (torch.tensor([3, 0, 1, 4, 2]), torch.tensor([0, 2, 2, 5]))
 TETRAHEDRA = TetrahedronSet.from_elements(torch.tensor([[0, 1, 2, 3], [1, 4, 2, 3], [4, 0, 1, 5]]), 7)
 REST = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1], [0, 1, -1], [5, 5, 5]])
@@ -69,6 +71,10 @@ OPS: dict[str, tuple[Callable, list[tuple[int, ...]]]] = {
     "attention dropout": (lambda *x: attention(*x, *SCENES, 0.7, 0.3, 5)[0], [(5, 2, 16), (7, 2, 16), (7, 2, 16)]),
     "attention no keys": (lambda *x: attention(*x, *EMPTY_SCENES)[0], [(5, 1, 16), (7, 1, 16), (7, 1, 16)]),
     "attention among tokens": (lambda x: attention(*x.unbind(1), *[SCENES[0]] * 2)[0], [(5, 3, 2, 16)]),
+    "attention_block": (
+        lambda x, context, *weights: attention_block(x, context, None, None, *SCENES, weights, 1),
+        [(5, 6), (7, 5), *BLOCK],
+    ),
     "message_sum": (
         lambda s, r, e, a, b, c, *w: message_sum(EDGES, s, r, e, (a, b, c), *w),
         [(4, 5), (5, 5), (7, 3), (8, 3), (8,), (5, 8), *LAYERS],

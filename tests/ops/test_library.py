@@ -6,11 +6,12 @@ import sys
 
 import pytest
 import torch
+from torch import Tensor
 from torch.fx.experimental.proxy_tensor import make_fx
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from ast_sim.ops import EdgeSet, attention_block, linear, message_edges, message_sum, mlp, segment_sum
 from ast_sim.ops import _segment as segment
-from ast_sim.ops import linear, mlp
 
 ORDER, OFFSETS = torch.tensor([2, 0, 1]), torch.tensor([0, 2, 3])
 
@@ -80,20 +81,61 @@ class Layers(torch.nn.Module):
         super().__init__()
         self.op, self.weight = op, torch.nn.Parameter(torch.arange(24.0).view(4, 6) - 12)
 
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
+    def forward(self, x: Tensor) -> Tensor:
         if self.op == "mlp":
             return mlp(x, self.weight, None, self.weight.T[:, :4], None)
         return linear(x, self.weight, None, "geglu")
 
 
+class Block(torch.nn.Module):
+    """An attention block that keeps the inputs of few vectors."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        shapes = [(16,), (16,), (16,), (16,), (16, 16), (32, 16), (16, 16), (16,), (16,), (16,), (8, 16), (8,), (16, 4)]
+        self.weights = torch.nn.ParameterList([torch.randn(shape) for shape in (*shapes, (16,))])
+
+    def forward(self, x: Tensor, turns: Tensor, offsets: Tensor) -> Tensor:
+        return attention_block(x, x, turns, turns, offsets, offsets, list(self.weights), 1)
+
+
+class Messages(torch.nn.Module):
+    """Messages without an encoder, which lets the op make an array of as many rows as there are edges, and their sum by
+    sender."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.arange(30.0).view(6, 5) - 12)
+
+    def forward(self, senders: Tensor, receivers: Tensor, offsets: Tensor, x: Tensor, latents: Tensor | None) -> Tensor:
+        edges, ones = EdgeSet(senders, receivers, offsets, 4), x.new_ones(6)
+        inputs = (x, x, latents, None, self.weight, ones, ones, ones)
+        total, messages = message_edges(edges, *inputs)
+        by_receiver = segment_sum(messages, *edges.by_receiver)
+        return torch.cat([total, messages, by_receiver, message_sum(edges, *inputs)])
+
+
+def rows_of(kind: str, num: int) -> tuple[Tensor | None, ...]:
+    """What `kind` takes."""
+    if kind == "attention_block":
+        return torch.randn(num, 16), torch.randn(num, 16), torch.tensor([0, num])
+    if "message" not in kind:
+        return (torch.randn(num, 6),)
+    receivers = torch.arange(num) * 4 // num
+    offsets = torch.searchsorted(receivers, torch.arange(5))
+    latents = torch.randn(num, 5) if kind == "message latents" else None
+    return torch.arange(num) % 4, receivers, offsets, torch.randn(4, 5), latents
+
+
 @pytest.mark.parametrize("strict", [False, True])
-@pytest.mark.parametrize("op", ["linear", "mlp"])
-def test_an_exported_graph_takes_any_number_of_rows(op, strict):
-    layers, few = Layers(op), torch.randn(7, 6)
-    shapes = ({0: torch.export.Dim("rows")},)
-    graph = torch.export.export(layers, (few,), dynamic_shapes=shapes, strict=strict).module()
-    for x in (few, torch.randn(17, 6)):
-        assert torch.equal(graph(x), layers(x))
+@pytest.mark.parametrize("kind", ["linear", "mlp", "attention_block", "message", "message latents"])
+def test_an_exported_graph_takes_any_number_of_rows(kind, strict):
+    module = Block() if kind == "attention_block" else Messages() if "message" in kind else Layers(kind)
+    few, rows = rows_of(kind, 7), {0: torch.export.Dim("rows")}
+    shapes = tuple([rows if x is not None and len(x) == 7 else None for x in few])
+    graph = torch.export.export(module, few, dynamic_shapes=shapes, strict=strict).module()
+    for given in (few, rows_of(kind, 17)):
+        assert torch.equal(graph(*given), module(*given))
 
 
 WITHOUT_SYMBOLS = "ctypes.CDLL = lambda path: object()"

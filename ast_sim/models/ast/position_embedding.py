@@ -32,13 +32,14 @@ class PositionEmbedding(nn.Module):
 
 
 def rotations(places: Tensor, head_dim: int) -> Tensor:
-    """Rotary embedding (Su et al. 2021, arXiv 2104.09864): places [T, 3] float64, in cell sides -> [T, 1, D / 2].
+    """Rotary embedding (Su et al. 2021, arXiv 2104.09864): places [T, 3] float64, in cell sides -> [T, D].
 
-    Each pair of components of a query or key is rotated by one of these complex64 numbers of length 1. The product of a
-    query and a key then depends only on the offset between their places. The angles are pi 2^-j times x, y and z, waves
-    of 2, 4, 8, ... cells, for j = 0, 1, ... as long as pairs are left. Up to two pairs at the end are not rotated.
+    Each pair of components of a query or key is rotated by an angle, of which this is cosine and sine, float32. The
+    product of a query and a key then depends only on the offset between their places. The angles are pi 2^-j times x, y
+    and z, waves of 2, 4, 8, ... cells, for j = 0, 1, ... as long as pairs are left. Up to two pairs at the end are not
+    rotated.
     """
     pairs = head_dim // 2
     angles = (places[:, :, None] * (math.pi * 0.5 ** torch.arange(pairs // 3, dtype=torch.float64))).flatten(1)
     angles = F.pad(angles, (0, pairs - angles.shape[1]))
-    return torch.complex(angles.cos().float(), angles.sin().float())[:, None]
+    return torch.stack([angles.cos(), angles.sin()], dim=2).flatten(1).float()

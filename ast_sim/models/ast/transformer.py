@@ -97,8 +97,8 @@ class AttentionBlock(nn.Module):
         return attention_block(
             vectors.x,
             context.x,
-            _as_real(vectors.rotations),
-            _as_real(context.rotations),
+            vectors.rotations,
+            context.rotations,
             vectors.offsets,
             context.offsets,
             parameters,
@@ -117,11 +117,6 @@ class AttentionBlock(nn.Module):
         q, k = rotated(q, vectors.rotations), rotated(k, context.rotations)
         seed = int(torch.randint(2**62, (1,))) if dropout else 0
         return attention(q, k, v, vectors.offsets, context.offsets, dropout_p=dropout, seed=seed)[0]
-
-
-def _as_real(rotations: Tensor | None) -> Tensor | None:
-    """[T, D]: cosine and sine of each pair of channels."""
-    return None if rotations is None else torch.view_as_real(rotations).flatten(1)
 
 
 def _of(layer: nn.LayerNorm | Linear) -> tuple[Tensor, Tensor]:
