@@ -137,7 +137,7 @@ AST_INLINE void block_norm_back(const block_norm_job *job, int64_t first, int64_
   for (int64_t i = first; i < first + rows; i++) {
     dense_copy_rows(job->x + i * n, n, 1, n, y, 0);
     const float scale = norm_centre(y, n, whole);
-    norm_backward(n, whole, job->gamma, job->dout + i * n, NULL, scale, NULL, y, columns);
+    norm_backward(i, n, whole, job->gamma, job->dout + i * n, NULL, scale, NULL, y, columns);
     for (int64_t j = 0; job->dx && j < n; j += VW) {
       const vf also = job->also ? vload_upto(job->also + i * n + j, n - j) : (vf){0};
       vstore_upto(job->dx + i * n + j, vload(y + j) + also, n - j);
@@ -150,16 +150,18 @@ static ast_status block_norm_back_task(int64_t index, void *context) {
   const dense_sum *sums = job->partials.sums;
   const int64_t row = sums[BLOCK_DGAMMA].row, first = index * job->chunks.rows,
                 last = min64(job->M, first + job->chunks.rows);
-  float *y = block_floats(4 * row), *partials = dense_start_chunk(&job->partials, index, first >= last);
+  float *y = block_floats((1 + NORM_COLUMNS) * row),
+        *partials = dense_start_chunk(&job->partials, index, first >= last);
   if (!y) return AST_NO_MEMORY;
-  const norm_columns columns = {.dgamma = y + row, .dbeta = y + 2 * row, .p = y + 3 * row};
-  for (int64_t i = first; i < last; i += job->chunks.step) {
+  const norm_columns columns = norm_new_columns(y + row, row);
+  for (int64_t i = first, block = 0; i < last; i += job->chunks.step, block++) {
     const int64_t rows = min64(job->chunks.step, last - i);
-    memset(y + row, 0, 2 * (size_t)row * sizeof *y); /* sums of the block first, so that long sums stay accurate */
+    dense_begin_block(&job->partials, block, partials);
+    norm_clear_columns(&columns); /* sums of the block first, so that long sums stay accurate */
     if (job->n % VW) block_norm_back(job, i, rows, y, &columns, false);
     else block_norm_back(job, i, rows, y, &columns, true);
-    dense_add_rows(columns.dgamma, 0, 1, row, partials + sums[BLOCK_DGAMMA].at);
-    dense_add_rows(columns.dbeta, 0, 1, row, partials + sums[BLOCK_DBETA].at);
+    dense_add_rows(columns.dgamma, row, NORM_CHAINS, row, partials + sums[BLOCK_DGAMMA].at);
+    dense_add_rows(columns.dbeta, row, NORM_CHAINS, row, partials + sums[BLOCK_DBETA].at);
   }
   return AST_OK;
 }
@@ -171,7 +173,7 @@ static ast_status block_norm_backward(const float *x, int64_t M, int64_t n, cons
   dense_sum sums[BLOCK_SUMS] = {{.to = dgamma, .rows = 1, .n = n}, {.to = dbeta, .rows = 1, .n = n}};
   job.partials = dense_place_sums(sums, BLOCK_SUMS);
   job.chunks = dense_cut(M, job.partials.size);
-  if (!dense_new_partials(&job.partials, job.chunks.num)) return AST_NO_MEMORY;
+  if (!dense_new_partials(&job.partials, job.chunks.num, dense_blocks(job.chunks))) return AST_NO_MEMORY;
   const ast_status status = ast_parallel(job.chunks.num, block_norm_back_task, &job);
   return status == AST_OK ? dense_add_partials(&job.partials) : status;
 }

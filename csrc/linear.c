@@ -8,9 +8,9 @@
  *
  * Forward, a task owns a block of rows and some panels of columns. The gradient of W is a sum over rows, cut by the
  * shapes alone, in one of two ways. By rows: a task owns a chunk of rows, and while a block of them lies in the cache
- * takes dz, dx and its part of dW from it; the parts are added in order. By tiles, where the parts would be larger
- * than x and dz: dz by blocks of rows, unless it is dout itself, then side by side dW by tiles of W, each over all
- * rows, and dx as a product like the forward one.
+ * takes dz, dx and its part of dW from it; the parts are added in a fixed order. By tiles, where the parts would be
+ * larger than x and dz: dz by blocks of rows, unless it is dout itself, then side by side dW by tiles of W, each over
+ * all rows, and dx as a product like the forward one.
  *
  * Cost: 2 M I O operations for z, for dx and for dW each. Memory: the packed weights, and either the parts or, where
  * they are not dout and x themselves, dz and x.
@@ -172,17 +172,18 @@ static ast_status linear_chunk_task(int64_t index, void *context) {
   if (!dz) return AST_NO_MEMORY;
   float *x = dz + DENSE_ROWS * job->dz_row;
   float *partials = dense_start_chunk(&job->partials, index, first >= last);
-  for (int64_t i = first; i < last; i += job->chunks.step) {
+  for (int64_t i = first, block = 0; i < last; i += job->chunks.step, block++) {
     const int64_t rows = min64(job->chunks.step, last - i);
+    const bool add = dense_begin_block(&job->partials, block, partials);
     linear_backward_rows(job, i, rows, dz, x, partials + sums[1].at);
     if (job->dweight)
-      gemm(sizes->O, sums[0].row, rows, dz, job->dz_row, x, job->x_row, partials + sums[0].at, sums[0].row, i > first);
+      gemm(sizes->O, sums[0].row, rows, dz, job->dz_row, x, job->x_row, partials + sums[0].at, sums[0].row, add);
   }
   return AST_OK;
 }
 
 static ast_status linear_by_rows(linear_backward_job *job) {
-  if (!dense_new_partials(&job->partials, job->chunks.num)) return AST_NO_MEMORY;
+  if (!dense_new_partials(&job->partials, job->chunks.num, dense_blocks(job->chunks))) return AST_NO_MEMORY;
   const ast_status status = ast_parallel(job->chunks.num, linear_chunk_task, job);
   return status == AST_OK ? dense_add_partials(&job->partials) : status;
 }
@@ -221,10 +222,14 @@ static ast_status linear_tile_task(int64_t index, void *context) {
       memcpy(job->dweight + (o + i) * sizes->I + k, tile + i * width, (size_t)columns * sizeof *tile);
   }
   if (job->dbias && k == 0) {
-    float *sums = tile;
+    float *sums = tile, *chain = tile + round_up(rows, VW);
     memset(sums, 0, (size_t)round_up(rows, VW) * sizeof *sums);
-    for (int64_t i = 0; i < sizes->M; i += DENSE_ROWS)
-      dense_add_rows(dz.data + i * dz.row + o, dz.row, min64(DENSE_ROWS, sizes->M - i), rows, sums);
+    for (int64_t i = 0; i < sizes->M;) {
+      memset(chain, 0, (size_t)round_up(rows, VW) * sizeof *chain);
+      for (const int64_t end = min64(sizes->M, i + DENSE_CHAIN * DENSE_ROWS); i < end; i += DENSE_ROWS)
+        dense_add_rows(dz.data + i * dz.row + o, dz.row, min64(DENSE_ROWS, end - i), rows, chain);
+      dense_add_rows(chain, 0, 1, rows, sums);
+    }
     memcpy(job->dbias + o, sums, (size_t)rows * sizeof *sums);
   }
   return AST_OK;

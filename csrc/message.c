@@ -56,10 +56,9 @@ typedef struct {
 
 static bool message_new_tile(const message_weights *w, message_tile *t) {
   const int64_t size = MESSAGE_TILE * w->row;
-  float *memory = ast_scratch(3 * (size + w->row) * (int64_t)sizeof *memory);
+  float *memory = ast_scratch((3 * size + NORM_COLUMNS * w->row) * (int64_t)sizeof *memory);
   if (!memory) return false;
-  float *columns = memory + 3 * size;
-  *t = (message_tile){memory, memory + size, memory + 2 * size, {columns, columns + w->row, columns + 2 * w->row}};
+  *t = (message_tile){memory, memory + size, memory + 2 * size, norm_new_columns(memory + 3 * size, w->row)};
   return true;
 }
 

@@ -15,8 +15,8 @@
  * up in order.
  *
  * Cost per edge: the forward flops again, and twice as many for the two products per layer (but E H once, unless de is
- * wanted). Memory: at most ROUND_TASKS sums of weight gradients and ROUND_TASKS * TASK_TILES * MESSAGE_TILE rows of dz,
- * 11 MB at 128 channels.
+ * wanted). Memory: at most 2 ROUND_TASKS sums of weight gradients and ROUND_TASKS * TASK_TILES * MESSAGE_TILE rows of
+ * dz, 13 MB at 128 channels.
  */
 #include "weight_panels.h"
 
@@ -70,23 +70,22 @@ AST_INLINE void message_norm_backward(const message_backward_job *job, int64_t f
   const ast_message *step = job->w.step;
   const dense_sum *sums = job->partials.sums;
   const int64_t F2 = step->F2, row = job->w.row;
-  memset(t->columns.dgamma, 0, (size_t)row * sizeof(float));
-  memset(t->columns.dbeta, 0, (size_t)row * sizeof(float));
+  norm_clear_columns(&t->columns);
   for (int64_t i = 0; i < n; i++) {
     float *y = t->y + i * row;
     const float *dmessage = job->dmessages ? job->dmessages + (first + i) * F2 : NULL;
     const float scale = norm_centre(y, F2, whole);
-    norm_backward(F2, whole, step->gamma, job->dsum + step->receivers[first + i] * F2, dmessage, scale, NULL, y,
+    norm_backward(i, F2, whole, step->gamma, job->dsum + step->receivers[first + i] * F2, dmessage, scale, NULL, y,
                   &t->columns);
   }
-  dense_add_rows(t->columns.dgamma, 0, 1, F2, partials + sums[MESSAGE_DGAMMA].at);
-  dense_add_rows(t->columns.dbeta, 0, 1, F2, partials + sums[MESSAGE_DBETA].at);
+  dense_add_rows(t->columns.dgamma, row, NORM_CHAINS, F2, partials + sums[MESSAGE_DGAMMA].at);
+  dense_add_rows(t->columns.dbeta, row, NORM_CHAINS, F2, partials + sums[MESSAGE_DBETA].at);
   dense_add_rows(t->y, row, n, F2, partials + sums[MESSAGE_DB2].at);
 }
 
-/* dz of the tile into the buffer, and the weight gradients added to the partial sums, or put there if the sums of the
- * matrices are `fresh`. */
-static void message_tile_backward(const message_backward_job *job, int64_t first, int64_t n, bool fresh,
+/* dz of the tile into the buffer, and the weight gradients added to the partial sums, or put into the matrices among
+ * them unless `add`. */
+static void message_tile_backward(const message_backward_job *job, int64_t first, int64_t n, bool add,
                                   const message_tile *t, float *partials) {
   const message_weights *w = &job->w;
   const ast_message *step = w->step;
@@ -97,7 +96,7 @@ static void message_tile_backward(const message_backward_job *job, int64_t first
   if (step->F2 % VW) message_norm_backward(job, first, n, t, partials, false);
   else message_norm_backward(job, first, n, t, partials, true);
   /* forward: y = W2 x + b2, so dW2 = dy x^T and dx = W2^T dy */
-  gemm(step->F2, F, n, dy, row, t->x, row, partials + sums[MESSAGE_DW2].at, F, !fresh);
+  gemm(step->F2, F, n, dy, row, t->x, row, partials + sums[MESSAGE_DW2].at, F, add);
   dense_all(&w->layers[MESSAGE_W2_BACK], n, (gemm_a){dy, row, 1},
             (dense_end){.out = dz, .out_row = row, .hidden = t->x, .hidden_row = row});
   /* forward: x = relu(P + Q + e), so de = dz */
@@ -106,12 +105,12 @@ static void message_tile_backward(const message_backward_job *job, int64_t first
     memcpy(de + (first + i) * E, dz + i * row, (size_t)E * sizeof *de);
   if (!H) return;
   /* forward: x = relu(P + Q + A2 h), so dA2 = dz h^T and dh = A2^T dz */
-  gemm(step->F, H, n, dz, row, t->h, row, partials + sums[MESSAGE_DA2].at, H, !fresh);
+  gemm(step->F, H, n, dz, row, t->h, row, partials + sums[MESSAGE_DA2].at, H, add);
   dense_all(&w->layers[MESSAGE_A2_BACK], n, (gemm_a){dz, row, 1},
             (dense_end){.out = dc, .out_row = row, .hidden = t->h, .hidden_row = row});
   /* forward: h = relu(A1 e + a1), so da1 = dc, dA1 = dc e^T and de = A1^T dc */
   dense_add_rows(dc, row, n, step->H, partials + sums[MESSAGE_Da1].at);
-  gemm(E, H, n, step->edge_features + first * E, E, dc, row, partials + sums[MESSAGE_DA1].at, H, !fresh);
+  gemm(E, H, n, step->edge_features + first * E, E, dc, row, partials + sums[MESSAGE_DA1].at, H, add);
   if (de)
     dense_all(&w->layers[MESSAGE_A1_BACK], n, (gemm_a){dc, row, 1}, (dense_end){.out = de + first * E, .out_row = E});
 }
@@ -120,12 +119,15 @@ static ast_status message_backward_task(int64_t index, void *context) {
   const message_backward_job *job = context;
   const int64_t begin = job->begin + index * job->edges, end = min64(job->end, begin + job->edges);
   float *partials =
-      job->begin ? job->partials.memory + index * job->partials.size : dense_start_chunk(&job->partials, index, false);
+      job->begin ? job->partials.memory + index * job->partials.apart : dense_start_chunk(&job->partials, index, false);
   message_tile t;
   if (!message_new_tile(&job->w, &t)) return AST_NO_MEMORY;
   message_sort_by_part(job, begin, end, job->part_offsets + index * (PARTS + 1));
-  for (int64_t m = begin; m < end; m += MESSAGE_TILE)
-    message_tile_backward(job, m, min64(MESSAGE_TILE, end - m), m == index * job->edges, &t, partials);
+  int64_t block = job->begin / job->tasks / MESSAGE_TILE; /* tiles of this task in the rounds before */
+  for (int64_t m = begin; m < end; m += MESSAGE_TILE, block++) {
+    const bool add = dense_begin_block(&job->partials, block, partials);
+    message_tile_backward(job, m, min64(MESSAGE_TILE, end - m), add, &t, partials);
+  }
   return AST_OK;
 }
 
@@ -252,8 +254,8 @@ static ast_status message_backward(const ast_message *step, const float *restric
                       [MESSAGE_DBETA] = {.to = out->beta, .rows = 1, .n = step->F2},
                       [MESSAGE_Da1] = {.to = out->a1, .rows = 1, .n = step->H}};
   job.partials = dense_place_sums(sums, MESSAGE_SUMS);
-  if (!job.part_offsets || !job.by_part || !job.dz || !dA1 || !dense_new_partials(&job.partials, job.tasks) ||
-      !message_new_all_sums(&job))
+  if (!job.part_offsets || !job.by_part || !job.dz || !dA1 ||
+      !dense_new_partials(&job.partials, job.tasks, rounds * of_task) || !message_new_all_sums(&job))
     return AST_NO_MEMORY;
   if (!step->M) dense_start_chunk(&job.partials, 0, true);
   status = message_rounds(&job);

@@ -145,7 +145,7 @@ AST_INLINE void mlp_norm_backward(const mlp_backward_job *job, int64_t first, in
   for (int64_t i = first; i < first + rows; i++, y += job->y_row) {
     const float *kept = job->kept.normalized ? job->kept.normalized + i * mlp->O : NULL;
     const float scale = kept ? job->kept.scale[i] : norm_centre(y, mlp->O, whole);
-    norm_backward(mlp->O, whole, mlp->gamma, job->dout + i * mlp->dout_stride, NULL, scale, kept, y, columns);
+    norm_backward(i, mlp->O, whole, mlp->gamma, job->dout + i * mlp->dout_stride, NULL, scale, kept, y, columns);
   }
 }
 
@@ -171,13 +171,13 @@ static void mlp_backward_rows(const mlp_backward_job *job, int64_t first, int64_
   } else {
     const dense_end end = {.out = y, .out_row = job->y_row};
     if (!job->kept.normalized) dense_all(&job->layers[MLP_SECOND], rows, units, end);
-    float *of_block = y + DENSE_ROWS * job->y_row; /* sums of the block first, so that long sums stay accurate */
-    const norm_columns columns = {of_block, of_block + sums[MLP_DGAMMA].row, of_block + 2 * sums[MLP_DGAMMA].row};
-    memset(of_block, 0, 2 * (size_t)sums[MLP_DGAMMA].row * sizeof *of_block);
+    /* sums of the block first, so that long sums stay accurate */
+    const norm_columns columns = norm_new_columns(y + DENSE_ROWS * job->y_row, sums[MLP_DGAMMA].row);
+    norm_clear_columns(&columns);
     if (mlp->O % VW) mlp_norm_backward(job, first, rows, y, &columns, false);
     else mlp_norm_backward(job, first, rows, y, &columns, true);
-    dense_add_rows(columns.dgamma, 0, 1, sums[MLP_DGAMMA].row, partials + sums[MLP_DGAMMA].at);
-    dense_add_rows(columns.dbeta, 0, 1, sums[MLP_DBETA].row, partials + sums[MLP_DBETA].at);
+    dense_add_rows(columns.dgamma, columns.row, NORM_CHAINS, columns.row, partials + sums[MLP_DGAMMA].at);
+    dense_add_rows(columns.dbeta, columns.row, NORM_CHAINS, columns.row, partials + sums[MLP_DBETA].at);
   }
   /* forward: y = h W2^T + bias2, so dW2 = dy^T h, dbias2 = dy and dh = dy W2 */
   if (sums[MLP_DWEIGHT2].to)
@@ -215,13 +215,15 @@ static ast_status mlp_backward_task(int64_t index, void *context) {
   const mlp_backward_job *job = context;
   const int64_t first = index * job->chunks.rows, last = min64(job->mlp->M, first + job->chunks.rows);
   const int64_t floats =
-      DENSE_ROWS * (job->input_row + job->hidden_row + job->y_row) + 3 * job->partials.sums[MLP_DGAMMA].row;
+      DENSE_ROWS * (job->input_row + job->hidden_row + job->y_row) + NORM_COLUMNS * job->partials.sums[MLP_DGAMMA].row;
   float *input = ast_scratch(floats * (int64_t)sizeof *input);
   if (!input) return AST_NO_MEMORY;
   float *hidden = input + DENSE_ROWS * job->input_row, *y = hidden + DENSE_ROWS * job->hidden_row;
   float *partials = dense_start_chunk(&job->partials, index, first >= last);
-  for (int64_t i = first; i < last; i += job->chunks.step)
-    mlp_backward_rows(job, i, min64(job->chunks.step, last - i), input, hidden, y, partials, i > first);
+  for (int64_t i = first, block = 0; i < last; i += job->chunks.step, block++) {
+    const bool add = dense_begin_block(&job->partials, block, partials);
+    mlp_backward_rows(job, i, min64(job->chunks.step, last - i), input, hidden, y, partials, add);
+  }
   return AST_OK;
 }
 
@@ -249,7 +251,7 @@ static ast_status mlp_backward(const ast_mlp *mlp, const float *restrict dout, a
                       [MLP_DBETA] = {.to = g.beta, .rows = 1, .n = mlp->O}};
   job.partials = dense_place_sums(sums, MLP_SUMS);
   job.chunks = dense_cut(mlp->M, job.partials.size);
-  if (!dense_new_partials(&job.partials, job.chunks.num)) return AST_NO_MEMORY;
+  if (!dense_new_partials(&job.partials, job.chunks.num, dense_blocks(job.chunks))) return AST_NO_MEMORY;
   status = ast_parallel(job.chunks.num, mlp_backward_task, &job);
   return status == AST_OK ? dense_add_partials(&job.partials) : status;
 }

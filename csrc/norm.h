@@ -1,4 +1,4 @@
-/* LayerNorm of rows y of n channels, in both directions, for mlp.c and message.c.
+/* LayerNorm of rows y of n channels, in both directions, for mlp.c, message.c and attention_block.c.
  *
  *   u = (y - mean(y)) / sd,   sd = sqrt(var(y) + eps),   out = gamma . u + beta
  *   p = gamma . dout,   dy = (p - mean(p) - u mean(p . u)) / sd,   dgamma = sum of dout . u,   dbeta = sum of dout
@@ -50,16 +50,29 @@ AST_INLINE vf norm_out(vf u, const float *gamma, const float *beta, int64_t c, i
   return vload_upto(gamma + c, lanes) * u + vload_upto(beta + c, lanes);
 }
 
-/* Of some rows: what dgamma and dbeta are so far, and room for p of one. */
+/* Of some rows: what dgamma and dbeta are so far, each in chains of every fourth row, and room for p of one. */
+enum { NORM_CHAINS = 4, NORM_COLUMNS = 2 * NORM_CHAINS + 1 /* rows in all */ };
+
 typedef struct {
-  float *dgamma, *dbeta, *p;
+  float *dgamma, *dbeta, *p; /* [NORM_CHAINS,row], the same, [row] */
+  int64_t row;
 } norm_columns;
 
-/* One row: y, from norm_centre, becomes dy. dout and `also`, unless NULL, are added; u is read if it was kept, and y is
+AST_INLINE norm_columns norm_new_columns(float *memory, int64_t row) {
+  return (norm_columns){memory, memory + NORM_CHAINS * row, memory + 2 * NORM_CHAINS * row, row};
+}
+
+AST_INLINE void norm_clear_columns(const norm_columns *columns) {
+  memset(columns->dgamma, 0, (size_t)(2 * NORM_CHAINS * columns->row) * sizeof(float));
+}
+
+/* Row i: y, from norm_centre, becomes dy. dout and `also`, unless NULL, are added; u is read if it was kept, and y is
  * not then. */
-AST_INLINE void norm_backward(int64_t n, const bool whole, const float *gamma, const float *dout, const float *also,
-                              float scale, const float *u_kept, float *y, const norm_columns *columns) {
-  float *dgamma = columns->dgamma, *dbeta = columns->dbeta, *p = columns->p;
+AST_INLINE void norm_backward(int64_t i, int64_t n, const bool whole, const float *gamma, const float *dout,
+                              const float *also, float scale, const float *u_kept, float *y,
+                              const norm_columns *columns) {
+  const int64_t chain = i % NORM_CHAINS * columns->row;
+  float *dgamma = columns->dgamma + chain, *dbeta = columns->dbeta + chain, *p = columns->p;
   vf sum = {0}, along = {0};
   for (int64_t c = 0; c < n; c += VW) {
     const int64_t lanes = whole ? VW : n - c;

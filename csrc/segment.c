@@ -5,7 +5,7 @@
  *
  * N rows n, C segments c, F channels; s_c is 1, or 1 over the rows of c. N F operations on 4 (N + C) F bytes: memory is
  * the limit. One chain of sums would collect rounding errors. So a segment is summed in the stored order by chains of
- * SEGMENT_CHAIN rows, whose sums are added by halves; the sum over all rows goes by blocks of COLUMN_ROWS likewise.
+ * SEGMENT_CHAIN rows, whose sums are added by halves; the sum over all rows goes by chains of COLUMN_CHAIN likewise.
  * Chains are counted from the first row of a segment, so the result depends on neither threads nor batch.
  */
 #include "ast.h"
@@ -126,12 +126,15 @@ static ast_status segment_spread(const float *restrict dout, int64_t F, const in
 
 /* ---- the sum over all rows ---- */
 
-enum { COLUMN_ROWS = 512 };
+enum {
+  COLUMN_CHAIN = 64, /* rows of one chain: of n equal rows it is off by up to n 2^-26 */
+  COLUMN_CHAINS = 8  /* of a task */
+};
 
 typedef struct {
   const float *x;
-  int64_t N, F;
-  float *sums; /* [blocks, F] */
+  int64_t N, F, chains;
+  float *sums; /* [chains, F] */
 } column_job;
 
 /* sum = the sum of some rows */
@@ -141,23 +144,32 @@ static void column_add_rows(const float *restrict x, int64_t rows, int64_t F, fl
     for (int64_t f = 0; f < F; f++) sum[f] += x[n * F + f];
 }
 
+/* The sums of `num` chains or tasks that lie `apart` floats from each other, added by halves to the first. */
+static void column_halves(float *sums, int64_t num, int64_t apart, int64_t F) {
+  for (int64_t step = 1; step < num; step *= 2)
+    for (int64_t i = 0; i + step < num; i += 2 * step)
+      for (int64_t f = 0; f < F; f++) sums[i * apart + f] += sums[(i + step) * apart + f];
+}
+
 static ast_status column_sum_task(int64_t index, void *context) {
   const column_job *job = context;
-  const int64_t first = index * COLUMN_ROWS;
-  column_add_rows(job->x + first * job->F, min64(COLUMN_ROWS, job->N - first), job->F, job->sums + index * job->F);
+  const int64_t F = job->F, begin = index * COLUMN_CHAINS, end = min64(job->chains, begin + COLUMN_CHAINS);
+  for (int64_t i = begin; i < end; i++) {
+    const int64_t first = i * COLUMN_CHAIN;
+    column_add_rows(job->x + first * F, min64(COLUMN_CHAIN, job->N - first), F, job->sums + i * F);
+  }
+  column_halves(job->sums + begin * F, end - begin, F, F);
   return AST_OK;
 }
 
 static ast_status column_sum(const float *restrict x, int64_t N, int64_t F, float *restrict out) {
   AST_SCRATCH_SCOPE;
-  const int64_t blocks = max64(1, divide_up(N, COLUMN_ROWS));
-  column_job job = {x, N, F, ast_scratch(blocks * F * (int64_t)sizeof *job.sums)};
+  const int64_t chains = max64(1, divide_up(N, COLUMN_CHAIN)), tasks = divide_up(chains, COLUMN_CHAINS);
+  column_job job = {x, N, F, chains, ast_scratch(chains * F * (int64_t)sizeof *job.sums)};
   if (!job.sums) return AST_NO_MEMORY;
-  const ast_status status = ast_parallel(blocks, column_sum_task, &job);
+  const ast_status status = ast_parallel(tasks, column_sum_task, &job);
   if (status != AST_OK) return status;
-  for (int64_t step = 1; step < blocks; step *= 2)
-    for (int64_t b = 0; b + step < blocks; b += 2 * step)
-      for (int64_t f = 0; f < F; f++) job.sums[b * F + f] += job.sums[(b + step) * F + f];
+  column_halves(job.sums, tasks, COLUMN_CHAINS * F, F);
   memcpy(out, job.sums, (size_t)F * sizeof *out);
   return AST_OK;
 }

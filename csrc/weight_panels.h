@@ -25,6 +25,7 @@ enum {
   DENSE_DEPTH = 192,       /* terms of one chain at most: its rounding errors grow with their number, */
   DENSE_SHALLOW = 32,      /* and with few outputs, where lanes lie idle anyway, short chains cost little */
   DENSE_FEW = 8,           /* outputs */
+  DENSE_CHAIN = 16,        /* blocks of one chain of a sum over blocks */
   DENSE_PACK = 1 << 16,    /* floats of weights from which several threads pack them */
   DENSE_PARTIALS = 1 << 24 /* floats at most of partial sums */
 };
@@ -326,19 +327,22 @@ static void dense_copy_rows(const float *from, int64_t from_row, int64_t rows, i
     for (int64_t j = 0; j < n; j += VW) vstore(to + i * to_row + j, vload_upto(from + i * from_row + j, n - j));
 }
 
-/* sums[j] += sum_i x_ij, n padded to whole vectors: four short chains over the rows first, so that long sums stay
- * accurate */
-static void dense_add_rows(const float *x, int64_t row, int64_t rows, int64_t n, float *sums) {
-  for (int64_t j = 0; j < n; j += VW) {
-    vf chain[4] = {{0}};
-    int64_t i = 0;
-    for (; i + 4 <= rows; i += 4) EACH(4, c) chain[c] += vload(x + (i + c) * row + j);
-    for (; i < rows; i++) chain[0] += vload(x + i * row + j);
-    vstore(sums + j, vload(sums + j) + ((chain[0] + chain[1]) + (chain[2] + chain[3])));
-  }
+/* The sum of vectors that lie `row` floats apart, by four short chains, so that long sums stay accurate. */
+AST_INLINE vf dense_four_chains(const float *x, int64_t row, int64_t rows) {
+  vf chain[4] = {{0}};
+  int64_t i = 0;
+  for (; i + 4 <= rows; i += 4) EACH(4, c) chain[c] += vload(x + (i + c) * row);
+  for (; i < rows; i++) chain[0] += vload(x + i * row);
+  return (chain[0] + chain[1]) + (chain[2] + chain[3]);
 }
 
-/* Rows are cut into chunks by their number alone; each chunk has its own partial sums, added in order at the end. */
+/* sums[j] += sum_i x_ij, n padded to whole vectors */
+static void dense_add_rows(const float *x, int64_t row, int64_t rows, int64_t n, float *sums) {
+  for (int64_t j = 0; j < n; j += VW) vstore(sums + j, vload(sums + j) + dense_four_chains(x + j, row, rows));
+}
+
+/* Rows are cut into chunks by their number alone; each chunk has its own partial sums, added at the end by four chains.
+ * The blocks of a chunk are added by chains of DENSE_CHAIN, whose sums are added to each other. */
 typedef struct {
   int64_t num, rows, step; /* chunks, rows of a chunk, rows of a block within it */
 } dense_chunks;
@@ -351,9 +355,12 @@ static dense_chunks dense_cut(int64_t M, int64_t floats) {
   return (dense_chunks){num, rows, blocks ? round_up(divide_up(rows, blocks), GEMM_ROWS) : DENSE_ROWS};
 }
 
+/* The blocks of a chunk. */
+AST_INLINE int64_t dense_blocks(dense_chunks chunks) { return divide_up(chunks.rows, chunks.step); }
+
 /* One of the gradients that are sums over rows: to [rows,n], or NULL if it is not wanted. Each chunk has a partial sum
  * of it, `at` in the memory of the chunk, rows of whole vectors `row` floats apart. Blocks add to vectors; to matrices
- * only the blocks behind the first one, which sets them. */
+ * only the blocks behind the first one of a chain, which sets them. */
 typedef struct {
   float *to;
   int64_t rows, n, at, row;
@@ -363,8 +370,9 @@ enum { DENSE_SUM_ROWS = 16 };
 
 typedef struct {
   dense_sum *sums;           /* [num] */
-  int64_t num, size, chunks; /* floats of a chunk; chunks */
-  float *memory;             /* [chunks,size] */
+  int64_t num, size, chunks; /* floats of all sums; chunks */
+  int64_t apart;             /* floats of a chunk: size, or 2 size where it has more than one chain */
+  float *memory;             /* [chunks,apart]: of the last chain, and of the chains before it */
 } dense_partials;
 
 /* Says where each sum lies. */
@@ -378,18 +386,39 @@ static dense_partials dense_place_sums(dense_sum *sums, int64_t num) {
   return partials;
 }
 
-static bool dense_new_partials(dense_partials *partials, int64_t chunks) {
+/* Room for chunks of at most `blocks` blocks. */
+static bool dense_new_partials(dense_partials *partials, int64_t chunks, int64_t blocks) {
   partials->chunks = chunks;
-  partials->memory = ast_scratch(chunks * partials->size * (int64_t)sizeof(float));
+  partials->apart = blocks > DENSE_CHAIN ? 2 * partials->size : partials->size;
+  partials->memory = ast_scratch(chunks * partials->apart * (int64_t)sizeof(float));
   return partials->memory;
 }
 
-/* The memory of a chunk, its vectors cleared, and if it is empty its matrices, too. */
-static float *dense_start_chunk(const dense_partials *partials, int64_t chunk, bool empty) {
-  float *memory = partials->memory + chunk * partials->size;
+/* Clears vectors, to which the blocks add, and all sums of a chunk that is empty. */
+static void dense_clear_sums(const dense_partials *partials, float *memory, bool empty) {
   for (const dense_sum *sum = partials->sums; sum < partials->sums + partials->num; sum++)
     if (sum->rows == 1 || empty) memset(memory + sum->at, 0, (size_t)(sum->rows * sum->row) * sizeof *memory);
+}
+
+/* The memory of a chunk before its first block. */
+static float *dense_start_chunk(const dense_partials *partials, int64_t chunk, bool empty) {
+  float *memory = partials->memory + chunk * partials->apart;
+  dense_clear_sums(partials, memory, empty);
+  if (partials->apart > partials->size) memset(memory + partials->size, 0, (size_t)partials->size * sizeof *memory);
   return memory;
+}
+
+/* Comes before each block of a chunk, counted from 0: whether it adds to the matrices of the chain, or sets them. */
+static bool dense_begin_block(const dense_partials *partials, int64_t block, float *memory) {
+  if (block % DENSE_CHAIN) return true;
+  if (block == 0) return false;
+  for (const dense_sum *sum = partials->sums; sum < partials->sums + partials->num; sum++) {
+    float *chain = memory + sum->at, *chains = chain + partials->size;
+    for (int64_t i = 0; sum->to && i < sum->rows * sum->row; i += VW)
+      vstore(chains + i, vload(chains + i) + vload(chain + i));
+  }
+  dense_clear_sums(partials, memory, false);
+  return false;
 }
 
 AST_INLINE int64_t dense_sum_tasks(const dense_sum *target) {
@@ -403,14 +432,15 @@ static ast_status dense_sum_task(int64_t index, void *context) {
   for (int64_t i = index * DENSE_SUM_ROWS; i < min64(target->rows, (index + 1) * DENSE_SUM_ROWS); i++)
     for (int64_t j = 0; j < target->n; j += VW) {
       const float *partial = partials->memory + target->at + i * target->row + j;
-      vf sum = vload(partial);
-      for (int64_t c = 1; c < partials->chunks; c++) sum += vload(partial + c * partials->size);
+      vf sum = dense_four_chains(partial, partials->apart, partials->chunks);
+      if (partials->apart > partials->size)
+        sum += dense_four_chains(partial + partials->size, partials->apart, partials->chunks);
       vstore_upto(target->to + i * target->n + j, sum, target->n - j);
     }
   return AST_OK;
 }
 
-/* The sums over all chunks, in their order. */
+/* The sums over all chunks. */
 static ast_status dense_add_partials(dense_partials *partials) {
   int64_t tasks = 0;
   for (int64_t i = 0; i < partials->num; i++) tasks += dense_sum_tasks(&partials->sums[i]);

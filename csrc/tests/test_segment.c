@@ -36,10 +36,11 @@ static void compare(const ast_kernels *kernels, int64_t N, int64_t C, int64_t F,
   FREE(x, out, back, order, offsets);
 }
 
-/* Of values that do not cancel: the rounding errors of one long chain would add up. */
-static void sum_columns(const ast_kernels *kernels, int64_t N, int64_t F) {
+/* Of values that do not cancel: the rounding errors of one long chain would add up, most of all where values are equal,
+ * since all have one sign then. */
+static void sum_columns(const ast_kernels *kernels, int64_t N, int64_t F, bool equal) {
   float *x = new_floats(N * F), *out = new_floats(F);
-  for (int64_t i = 0; i < N * F; i++) x[i] = 1 + random_float();
+  for (int64_t i = 0; i < N * F; i++) x[i] = equal ? 0.3f : 1 + random_float();
   memset(out, 0xff, (size_t)F * 4);
   CHECK(kernels->column_sum(x, N, F, out) == AST_OK, "status");
   for (int64_t f = 0; f < F; f++) {
@@ -81,8 +82,10 @@ static void test(const ast_kernels *kernels) {
     }
   static const int64_t rows[] = {0, 1, 511, 513, 2000};
   for (int f = 0; f < 11; f++)
-    for (int n = 0; n < 5; n++) sum_columns(kernels, rows[n], channels[f]);
-  sum_columns(kernels, 4000000, 1);
+    for (int n = 0; n < 5; n++)
+      for (int equal = 0; equal < 2; equal++) sum_columns(kernels, rows[n], channels[f], equal);
+  sum_columns(kernels, 4000000, 1, false);
+  sum_columns(kernels, 1000000, 1, true);
   static const int64_t lengths[] = {255, 256, 257, 511, 512, 513, 769};
   for (int f = 0; f < 11; f++)
     for (int n = 0; n < 7; n++) sum_one_segment(kernels, lengths[n], channels[f]);

@@ -55,6 +55,13 @@ def test_accuracy(rows, inputs, outputs, activation, with_residual):
     assert_accurate(fused(activation), composed(activation), inputs if with_residual else inputs[:3])
 
 
+def test_accuracy_of_a_million_equal_rows():
+    """All roundings of a chain of sums have one sign."""
+    inputs = [torch.full(shape, 0.3) for shape in ((1_000_000, 3), (4, 3), (4,))]
+    ends = [lambda *x, of=of: 0.1 * of(*x).sum(0) for of in (fused("none"), composed("none"))]
+    assert_accurate(*ends, inputs)
+
+
 @pytest.mark.parametrize("outputs", [1, 3])
 @pytest.mark.parametrize("activation", ["none", "relu"])
 def test_accuracy_of_odd_outputs(outputs, activation):

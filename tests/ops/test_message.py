@@ -75,6 +75,17 @@ WIDTHS += [(1, 0, 1, 4), (33, 0, 33, 65), (128, 0, 128, 128)]  # latents
 with_and_without_encoder = pytest.mark.parametrize("width, hidden, raw", [(24, 16, 3), (24, 0, 24)])
 
 
+def test_accuracy_of_a_million_equal_edges():
+    """All roundings of a chain of sums have one sign."""
+    nodes = torch.arange(1000)
+    edges = EdgeSet.from_pairs(nodes.repeat(1000), nodes.repeat_interleave(1000), 1000, 1000)
+    inputs = inputs_of(edges, 5, out=4)
+    inputs[:2] = [x[:1].repeat(1000, 1) for x in inputs[:2]]
+    factors = torch.tensor([0.1, 0.2, -0.3, 0.7])
+    ends = [lambda *x, of=of: (of(*x) * factors.to(x[0].dtype)).sum(0) for of in (fused(edges), composed(edges))]
+    assert_accurate(*ends, inputs)
+
+
 @pytest.mark.parametrize("width, hidden, raw, out", [*WIDTHS, (40, 0, 0, 24), (16, 16, 0, 16)])
 @pytest.mark.parametrize("size", SIZES)
 def test_accuracy(size, width, hidden, raw, out):

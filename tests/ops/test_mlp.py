@@ -56,6 +56,15 @@ def composed(keep):
     return function
 
 
+@pytest.mark.parametrize("norm", [False, True])
+def test_accuracy_of_a_million_equal_rows(norm):
+    """All roundings of a chain of sums have one sign."""
+    inputs, keep = chosen(case(1, 3, 5, 4), beside=False, norm=norm, residual=False)
+    inputs[0] = inputs[0].repeat(1_000_000, 1)
+    ends = [lambda *x, of=of: 0.1 * of(*x).sum(0) for of in (fused(keep), composed(keep))]
+    assert_accurate(*ends, inputs)
+
+
 def gradients(inputs, keep):
     leaves = [x.detach().clone().requires_grad_() for x in inputs]
     out = fused(keep)(*leaves)

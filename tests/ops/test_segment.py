@@ -145,6 +145,13 @@ def test_column_sum_of_a_million_rows():
     assert_accurate(segment.column_sum, lambda x: x.sum(0), [torch.rand(1_000_000, 3)])
 
 
+@pytest.mark.parametrize("value", [0.1, 0.3])
+@pytest.mark.parametrize("rows", [512, 5000, 1_000_000])
+def test_column_sum_of_equal_rows(rows, value):
+    """All roundings of a chain have one sign."""
+    assert_accurate(segment.column_sum, lambda x: x.sum(0), [torch.full((rows, 3), value)])
+
+
 def test_gradients_in_float64():
     x, order, offsets = case(9, 4, 3)
     assert torch.autograd.gradcheck(lambda x: segment_mean(x, order, offsets), x.double().requires_grad_())
