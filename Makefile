@@ -61,10 +61,11 @@ docs: $(VENV)/installed
 
 BUILDS := sanitized uninitialised races $(if $(X86),aarch64 wide) plain gcc11 clang
 CHECKS := $(foreach build,$(BUILDS),$(patsubst %,build/check/$(build)/%.passed,$(SLOW_FIRST))) \
-  $(addprefix build/check/fuzz_,$(addsuffix .passed,$(C_FUZZERS)))
+  build/check/undefined/no_memory.passed $(addprefix build/check/fuzz_,$(addsuffix .passed,$(C_FUZZERS)))
 
 # The C tests, which need no Python: optimised, under the address and undefined behaviour sanitizers, under the thread sanitizer,
-# under the memory sanitizer (what is read before it is written), and as GCC 11, clang and GCC for aarch64 (on an emulator) compile them. `wide` compiles the 64-byte source for AVX2, so
+# under the memory sanitizer (what is read before it is written), and as GCC 11, clang and GCC for aarch64 (on an emulator) compile them. What happens
+# where memory is lacking runs under clang's undefined behaviour sanitizer, too. `wide` compiles the 64-byte source for AVX2, so
 # that its logic is tested where there is no AVX-512. The kept inputs of the fuzz targets run once more.
 # Each test of each build is a target of its own, those that take longest first, so that with `--jobs` no core is left idle in the end.
 check: $(CHECKS)
@@ -145,6 +146,8 @@ COMPILE_plain := $(CC) $(C_FLAGS) $(WARNINGS) -O3
 COMPILE_sanitized := $(GCC) -O1 -g1 -DAST_UNFUSED -fsanitize=$(SANITIZE) -fno-sanitize-recover=all
 COMPILE_races := $(CLANG) -O1 -g1 -DAST_UNFUSED -fsanitize=thread
 COMPILE_uninitialised := $(CLANG) -O1 -g1 -DAST_UNFUSED -fsanitize=memory -fno-sanitize-recover=all
+# For `no_memory` alone: clang, not GCC, sees a pointer that is formed from memory that could not be had.
+COMPILE_undefined := $(CLANG) -O0 -g1 -DAST_UNFUSED -fsanitize=undefined -fno-sanitize-recover=all
 # -O0: the optimiser takes minutes over unrolled products with all these checks in them. Comparisons are not traced, nor branches of the
 # targets themselves: the sizes that a kernel compares do not stand in an input, and the tracing took most of the time.
 COMPILE_fuzz := $(CLANG) -O0 -g1 -fsanitize=fuzzer-no-link,$(SANITIZE) -fno-sanitize-coverage=trace-cmp -fno-sanitize-recover=all
@@ -155,7 +158,8 @@ COMPILE_gcc11 := gcc-11 $(C_FLAGS) $(GCC_WARNINGS) -O2
 COMPILE_clang := clang $(C_FLAGS) $(WARNINGS) -O2 -DAST_UNFUSED
 COMPILE_aarch64 := aarch64-linux-gnu-gcc $(C_FLAGS) $(GCC_WARNINGS) -O2
 
-CORE := isa_base dispatch parallel memory status tests/simd_base tests/bfloat16_base
+KERNELS := isa_base dispatch parallel memory status
+CORE := $(KERNELS) tests/simd_base tests/bfloat16_base
 ifneq ($(X86),)
 CORE_X86 := isa_avx2 isa_avx512
 # What differs in them no sanitizer sees: tiles read and write behind the compiler's back.
@@ -177,13 +181,13 @@ define BUILD
 build/check/$(1)/%.o: csrc/%.c $(C_SOURCES) | tools
 	@mkdir -p $$(@D)
 	@$(COMPILE_$(1)) $$(FLAGS_$$*) -c $$< -o $$@
-build/check/$(1)/core.a: $(patsubst %,build/check/$(1)/%.o,$(CORE) $(if $(filter wide aarch64,$(1)),,$(CORE_X86)) $(if $(filter plain gcc11 clang,$(1)),$(CORE_bfloat16)) $(if $(filter aarch64,$(1)),,$(SIMD_X86)))
+build/check/$(1)/core.a: $(patsubst %,build/check/$(1)/%.o,$(if $(filter undefined,$(1)),$(KERNELS),$(CORE) $(if $(filter wide aarch64,$(1)),,$(CORE_X86)) $(if $(filter plain gcc11 clang,$(1)),$(CORE_bfloat16)) $(if $(filter aarch64,$(1)),,$(SIMD_X86))))
 	@ar rcs $$@ $$^
 $(patsubst %,build/check/$(1)/test_%,$(C_TESTS)): build/check/$(1)/test_%: csrc/tests/test_%.c $(C_TEST_HEADERS) build/check/$(1)/core.a
 	@$(COMPILE_$(1)) $$< build/check/$(1)/core.a -lm $$(LINK_test_$$*) -o $$@
 endef
-$(foreach build,$(BUILDS) fuzz,$(eval $(call BUILD,$(build))))
-build/check/wide/%.o build/check/aarch64/%.o: FLAGS_dispatch :=
+$(foreach build,$(BUILDS) undefined fuzz,$(eval $(call BUILD,$(build))))
+build/check/wide/%.o build/check/aarch64/%.o build/check/undefined/%.o: FLAGS_dispatch :=
 build/check/plain/%.o build/check/gcc11/%.o build/check/clang/%.o: FLAGS_dispatch += $(if $(X86),-DAST_HAVE_AVX512_BF16 -DAST_HAVE_AMX)
 
 $(addprefix build/check/fuzz/fuzz_,$(C_FUZZERS)): build/check/fuzz/fuzz_%: csrc/tests/fuzz_%.c csrc/tests/test_%.c $(C_TEST_HEADERS) build/check/fuzz/core.a
@@ -202,6 +206,7 @@ RUN_races = env AST_TEST_QUICK=1 $$(setarch -R true 2>/dev/null && echo setarch 
 RUN_uninitialised := env AST_TEST_QUICK=1
 RUN_gcc11 := env AST_TEST_QUICK=1
 RUN_clang := env AST_TEST_QUICK=1
+RUN_undefined := env AST_TEST_QUICK=1
 RUN_aarch64 := env AST_TEST_QUICK=1 qemu-aarch64 -L /usr/aarch64-linux-gnu
 NAME_plain := optimised
 NAME_sanitized := address and undefined behaviour sanitizers
@@ -209,6 +214,7 @@ NAME_races := thread sanitizer
 NAME_uninitialised := memory sanitizer
 NAME_gcc11 := GCC 11
 NAME_clang := clang
+NAME_undefined := clang, undefined behaviour sanitizer
 NAME_wide := 64 byte vectors on AVX2
 NAME_aarch64 := aarch64
 
@@ -218,7 +224,7 @@ $(patsubst %,build/check/$(1)/%.passed,$(C_TESTS)): build/check/$(1)/%.passed: b
 	@$$(RUN_$(1)) $$<
 	@touch $$@
 endef
-$(foreach build,$(BUILDS),$(eval $(call RUN,$(build))))
+$(foreach build,$(BUILDS) undefined,$(eval $(call RUN,$(build))))
 
 # Where each request for scratch memory is an allocation of its own, as under this sanitizer, every way to fail takes three minutes.
 build/check/sanitized/no_memory.passed: RUN_sanitized += AST_TEST_QUICK=1
