@@ -108,10 +108,6 @@ def nastran(folder, text):
 @pytest.mark.parametrize(
     ("text", "cause"),
     [
-        (GRIDS.replace(grid(8, POINTS[7]), grid(8, POINTS[7], "5")), "GRID with a coordinate system of its own"),
-        ("GRID,1,5,0.,0.,0.\n", "GRID with a coordinate system of its own"),
-        (f"{'GRID*':8}{1:16}{5:16}{0.0:16}{0.0:16}\n{'*':8}{0.0:16}\n", "GRID with a coordinate system of its own"),
-        (f"GRDSET  {'':8}{5:8}\n{WHOLE}", "GRDSET with a coordinate system of its own"),
         (f"{WHOLE}CHEX20  {7:8}{1:8}\n", "CHEX20 elements"),
         (f"{WHOLE}CQUADX,7,1,1,2,3,4\n", "CQUADX elements"),
     ],
