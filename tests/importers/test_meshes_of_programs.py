@@ -281,7 +281,6 @@ def test_polygons_and_strips_of_vtk_are_cut_into_triangles(tmp_path, ending):
 @pytest.mark.parametrize(
     ("name", "content", "cause"),
     [
-        ("a.mesh", "MFEM mesh v1.0\n", "is no .mesh file of Medit, but begins with 'MFEM mesh v1.0'"),
         ("a.mesh", "\n% GETFEM MESH FILE\n", "is no .mesh file of Medit, but begins with '% GETFEM MESH FILE'"),
         ("a.obj", "L\1\0\0.text", "is no text; compilers use this ending, too"),
         ("a.obj", "P 0.3 0.3 0.4 10 1 8\n1.0 2.0 3.0\n", "holds no points as OBJ files do"),

@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-from ast_sim.importers.formats.nastran_axes import NastranPoints
+from ast_sim.importers.decks.nastran_axes import NastranPoints
 from ast_sim.importers.formats.source_mesh import INSTEAD
 from ast_sim.support.errors import DatasetError
 
