@@ -96,6 +96,7 @@ def test_a_mesh_alone_and_flat_points_with_a_column_of_zeros(tmp_path):
     [
         (series(TIMES.replace("2.5", "")), "lists 2 times for 3 frames"),
         (series(TIMES.replace("2.5", "late")), "the times of a series are no numbers"),
+        (series().replace("</Topology>", '</Topology><Time Value="9" />', 1), "some have a Time of their own"),
         (grid(points="corners"), "refers to .*corners.*, which it does not hold"),
         (
             f'<DataItem Name="a" Dimensions="8 3">{item("b")}</DataItem><DataItem Name="b" Dimensions="8 3">{item("a")}'

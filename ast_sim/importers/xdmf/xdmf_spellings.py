@@ -23,7 +23,7 @@ def with_own_times(path: Path, tree: ET.ElementTree[Any]) -> bool:
     """Give each frame of a series its time, where the series lists them. Whether one does.
 
     Raises:
-        DatasetError: the list is not one of numbers, or has another length than the series.
+        DatasetError: the list is not one of numbers, has another length than the series, or is not alone.
     """
     listed = [(series, time) for series in tree.iter("Grid") for time in series.findall("Time[@TimeType]")]
     listed = [(series, time) for series, time in listed if time.get("TimeType", "").upper() in ("LIST", "HYPERSLAB")]
@@ -37,6 +37,8 @@ def with_own_times(path: Path, tree: ET.ElementTree[Any]) -> bool:
             values = [values[0] + values[1] * row for row in range(int(values[2]))]
         if len(values) != len(grids):
             raise DatasetError(f"{path}: lists {len(values)} times for {len(grids)} frames")
+        if any(grid.find("Time") is not None for grid in grids):
+            raise DatasetError(f"{path}: lists the times of its frames, and some have a Time of their own: write one")
         series.remove(time)
         for grid, value in zip(grids, values, strict=True):
             ET.SubElement(grid, "Time", Value=repr(value))
