@@ -127,6 +127,7 @@ def test_freefem_in_space_and_in_the_plane(tmp_path):
         ("a.mesh", MFEM, "it says that it holds 11 vertices, but there are 0"),
         ("a.mesh", MFEM.replace("5 4 0 1 2 3", "5 4 0 1 2 33") + "3\n" + ROWS, "refers to a point that there is not"),
         ("a.mesh", MFEM.replace("5 4 0 1 2 3", "5 4 0 1 2") + "3\n" + ROWS, "it is damaged"),
+        ("a.mesh", MFEM.replace("5 4 0 1 2 3", "5 -1 0 1 2 3 4") + "3\n" + ROWS, "it is damaged: -1"),
         ("a.msh", GID.replace("\n20 ", "\n10 "), "a point has the number of another one"),
         ("a.msh", GID.replace("Tetrahedra", "Sphere"), "has the line 'MESH .*Sphere.*, which is not read"),
         ("a.msh", GID.replace("1 10 20 30 40 3", "1 10 20 30 40 3 9"), "element 1 has 6 entries behind its number"),

@@ -16,7 +16,7 @@ import numpy as np
 from ast_sim.importers.formats.source_mesh import INSTEAD, CellBlock, SourceMesh, node_count
 from ast_sim.support.errors import DatasetError
 
-_KINDS_OF_MFEM = ("vertex", "line", "triangle", "quad", "tetra", "hexahedron", "wedge", "pyramid")
+_KINDS_OF_MFEM = dict(enumerate(("vertex", "line", "triangle", "quad", "tetra", "hexahedron", "wedge", "pyramid")))
 
 _KINDS_OF_GID = {
     "point": "vertex",
