@@ -177,7 +177,8 @@ def _gid(path: Path, lines: list[list[str]]) -> SourceMesh:
     points: list[list[str]] = []
     rows: dict[str, list[list[int]]] = defaultdict(list)
     parts: dict[str, list[int]] = defaultdict(list)
-    name, kind, dimension = "", "", 0
+    name = kind = ""
+    dimension = 0
     entries = iter(lines)
     for words in entries:
         if words[0].lower() == "mesh":
