@@ -14,6 +14,7 @@ from ast_sim.element_topology import is_closed
 from ast_sim.importers.decks.deck_mesh import deck_mesh
 from ast_sim.importers.formats.source_mesh import CellBlock, SourceMesh
 from ast_sim.importers.formats.stl_file import BadSurface, read_stl
+from ast_sim.importers.formats.text_meshes import reader_of
 from ast_sim.importers.formats.vtk_files import BLOCKS, ENDINGS, is_dyna, vtk_frames
 from ast_sim.importers.meshio_files import BY_MESHIO, by_meshio
 from ast_sim.importers.msh.gmsh_fields import has_steps
@@ -89,7 +90,8 @@ def frames_in(path: Path) -> Iterator[SourceMesh]:
     elif ending in XDMF:
         yield from xdmf_frames(path)
     else:
-        yield by_meshio(path)
+        read = reader_of(ending, _beginning(path)) or by_meshio
+        yield read(path)
 
 
 def _ending_of_vtk(path: Path) -> str:

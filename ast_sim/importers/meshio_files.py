@@ -12,7 +12,7 @@ from typing import Any
 
 import h5py
 
-from ast_sim.importers.formats.nastran_cards import plain_nastran
+from ast_sim.importers.decks.nastran_cards import plain_nastran
 from ast_sim.importers.formats.source_mesh import INSTEAD, SourceMesh, from_meshio
 from ast_sim.importers.formats.text_surfaces import plain_obj, plain_off, plain_ply, require_header_of_ply
 from ast_sim.support.errors import DatasetError

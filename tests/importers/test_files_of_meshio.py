@@ -73,7 +73,7 @@ def test_files_of_dolfin_that_lack_an_entry_are_refused(tmp_path, old, new, caus
     ("content", "cause"),
     [
         ("", "is no .msh file of Gmsh's format 4.1 or 2.2, or damaged"),
-        ("9 8 8\n0 0 4\n0.5 0 1\n", "is no .msh file of Gmsh's format 4.1 or 2.2, or damaged"),
+        ("9 8\n0 0 4\n0.5 0 1\n", "is no .msh file of Gmsh's format 4.1 or 2.2, or damaged"),
         ('(0 "Fluent")\n(2 3)\n(10 (0 1 3 0))\n(13 (0 1 1 0))\n', "lists the faces of its cells, as Fluent does"),
         ("(2 3)\n(10 (0 1 3 0))\n( 3013 ( 3 1 1 2 3)(", "lists the faces of its cells, as Fluent does"),
     ],
@@ -108,10 +108,6 @@ def nastran(folder, text):
 @pytest.mark.parametrize(
     ("text", "cause"),
     [
-        (GRIDS.replace(grid(8, POINTS[7]), grid(8, POINTS[7], "5")), "GRID with a coordinate system of its own"),
-        ("GRID,1,5,0.,0.,0.\n", "GRID with a coordinate system of its own"),
-        (f"{'GRID*':8}{1:16}{5:16}{0.0:16}{0.0:16}\n{'*':8}{0.0:16}\n", "GRID with a coordinate system of its own"),
-        (f"GRDSET  {'':8}{5:8}\n{WHOLE}", "GRDSET with a coordinate system of its own"),
         (f"{WHOLE}CHEX20  {7:8}{1:8}\n", "CHEX20 elements"),
         (f"{WHOLE}CQUADX,7,1,1,2,3,4\n", "CQUADX elements"),
     ],

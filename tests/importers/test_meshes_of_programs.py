@@ -62,7 +62,7 @@ def test_decks_of_nastran_as_gmsh_writes_them_are_read(tmp_path, order):
         (r"\$ENDNOD", "", "the section NOD has no end"),
         (r"\$ENDELM", "", "the section ELM has no end"),
         (r"(\d+ 4 5 1 4 \d+ \d+ \d+) \d+\n", r"\1\n", "element [0-9]+ has 3 nodes"),
-        (r"\$ELM\n", "$ELM\n1", "it says that it holds 1[0-9]+ elements, but there are"),
+        (r"\$ELM\n", "$ELM\n1", "it says that it holds 1[0-9,]+ elements, but there are"),
     ],
 )
 def test_damaged_files_of_the_first_format_are_refused(tmp_path, old, new, cause):
@@ -281,7 +281,6 @@ def test_polygons_and_strips_of_vtk_are_cut_into_triangles(tmp_path, ending):
 @pytest.mark.parametrize(
     ("name", "content", "cause"),
     [
-        ("a.mesh", "MFEM mesh v1.0\n", "is no .mesh file of Medit, but begins with 'MFEM mesh v1.0'"),
         ("a.mesh", "\n% GETFEM MESH FILE\n", "is no .mesh file of Medit, but begins with '% GETFEM MESH FILE'"),
         ("a.obj", "L\1\0\0.text", "is no text; compilers use this ending, too"),
         ("a.obj", "P 0.3 0.3 0.4 10 1 8\n1.0 2.0 3.0\n", "holds no points as OBJ files do"),

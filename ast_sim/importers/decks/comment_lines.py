@@ -15,7 +15,7 @@ _ALIKE = 0.85
 _NUMBER = re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([dDeE]?[-+]?[0-9]+)?|")
 
 # Keywords whose data lines are read: a comment among these lines loses some of them.
-_READ = {"NODE", "ELEMENT", "NSET", "ELSET", "SYSTEM", "INSTANCE", "BOUNDARY"}
+_READ = {"NODE", "ELEMENT", "NSET", "ELSET", "SYSTEM", "INSTANCE", "BOUNDARY", "NGEN", "NFILL", "NCOPY", "ELGEN"}
 
 # What may stand behind the target of a line of *BOUNDARY.
 _HELD = {"ENCASTRE", "PINNED", "XSYMM", "YSYMM", "ZSYMM", "XASYMM", "YASYMM", "ZASYMM"}

@@ -40,8 +40,9 @@ def from_angles(points: np.ndarray, spherical: bool) -> np.ndarray:
     return np.stack([flat * np.cos(angle), flat * np.sin(angle), height], axis=1)
 
 
-def placement_of(keyword: Keyword) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation and shift of an instance: it is first moved, then turned about the axis from one point to another."""
+def placement_of(keyword: Keyword, times: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation and shift of an instance or a copy: it is first moved, then turned about the axis from one point to
+    another, several `times`."""
     from scipy.spatial.transform import Rotation
 
     rows = [[real(text, line) for text in (*tokens(line), *[""] * 7)[:7]] for line in keyword.data]
@@ -49,8 +50,8 @@ def placement_of(keyword: Keyword) -> tuple[np.ndarray, np.ndarray]:
         raise keyword.error("has more than two data lines")
     if rows and len(tokens(keyword.data[0])) > 3:  # an empty line for no shift is no data line here
         raise DatasetError(
-            f"{keyword.data[0].place}: the first line of an instance is its shift, three numbers: write 0, 0, 0 before"
-            " the line of a rotation"
+            f"{keyword.data[0].place}: the first line of *{keyword.name} is its shift, three numbers: write 0, 0, 0"
+            " before the line of a rotation"
         )
     if len(rows) == 2 and len(tokens(keyword.data[1])) != 7:
         raise DatasetError(
@@ -61,7 +62,7 @@ def placement_of(keyword: Keyword) -> tuple[np.ndarray, np.ndarray]:
         return np.eye(3), shift
     start = np.array(rows[1][:3])
     end = np.array(rows[1][3:6])
-    angle = np.radians(rows[1][6])
+    angle = times * np.radians(rows[1][6])
     length = np.linalg.norm(end - start)
     if not length > 0:
         raise keyword.error("the axis of the rotation has no length")

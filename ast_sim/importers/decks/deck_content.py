@@ -6,25 +6,24 @@ error that names it. Keywords that say something else (materials, loads, steps) 
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 from ast_sim.importers.decks.comment_lines import is_keyword, require_keyword
 from ast_sim.importers.decks.deck_axes import from_angles, placement_of, system_of
 from ast_sim.importers.decks.deck_numbers import elements_of, nodes_in, nodes_of, tokens, whole
+from ast_sim.importers.decks.deck_parts import Content, Deck, ElementBlock, Instance, Members, Sets, UsersOwn
 from ast_sim.importers.decks.element_types import is_users_own, kind_of
 from ast_sim.importers.decks.keyword_lines import Keyword, read_keywords
+from ast_sim.importers.decks.made_from_others import elements_made, nodes_made
 from ast_sim.importers.formats.source_mesh import node_count
 from ast_sim.support.errors import DatasetError, counted
 
 # Keywords that make, move or remove nodes or elements, and that are not understood here.
 _CHANGE_THE_MESH = {
-    *("NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "IMPORT", "IMPERFECTION", "REFINEMESH"),
+    *("NMAP", "IMPORT", "IMPERFECTION", "REFINEMESH"),
     *("SYMMETRICMODELGENERATION", "SYMMETRICRESULTSTRANSFER", "PARAMETERSHAPEVARIATION", "PARAMETERDEPENDENCE"),
     *("ADAPTIVEMESH", "MESHREFINEMENT", "NODALTRANSLATION", "IMPORTNSET", "IMPORTELSET"),
 }
@@ -32,88 +31,22 @@ _CHANGE_THE_MESH = {
 _OPTIONS = {
     "NODE": {"NSET", "SYSTEM", "INPUT"},
     "ELEMENT": {"TYPE", "ELSET", "INPUT"},
-    "NSET": {"NSET", "GENERATE", "ELSET", "INSTANCE", "INTERNAL", "UNSORTED", "INPUT"},
-    "ELSET": {"ELSET", "GENERATE", "INSTANCE", "INTERNAL", "UNSORTED", "INPUT"},
+    "NSET": {"NSET", "GENERATE", "GEN", "ELSET", "INSTANCE", "INTERNAL", "UNSORTED", "INPUT"},
+    "ELSET": {"ELSET", "GENERATE", "GEN", "INSTANCE", "INTERNAL", "UNSORTED", "INPUT"},
     "PART": {"NAME"},
     "ASSEMBLY": {"NAME"},
     "INSTANCE": {"NAME", "PART"},
     "SYSTEM": set(),
+    "NGEN": {"LINE", "NSET", "SYSTEM"},
+    "NFILL": {"NSET", "BIAS", "TWOSTEP"},
+    "NCOPY": {"CHANGENUMBER", "OLDSET", "NEWSET", "SHIFT", "MULTIPLE", "REFLECT", "POLE"},
+    "ELGEN": {"ELSET", "ALLNODES"},
+    "ELCOPY": {"ELEMENTSHIFT", "SHIFTNODES", "OLDSET", "NEWSET", "REFLECT"},
     **dict.fromkeys(("ENDPART", "ENDASSEMBLY", "ENDINSTANCE"), set()),
 }
 
 # Surfaces of rigid tools that a formula describes: no element belongs to them.
 _FORMULAS = {"SEGMENTS", "CYLINDER", "REVOLUTION", "USER"}
-
-
-class Members(NamedTuple):
-    """Nodes or elements of a set: the instance that they belong to ("" for the scope itself), and their numbers. A set
-    of nodes may have the nodes of elements."""
-
-    instance: str
-    numbers: np.ndarray
-    of_elements: bool = False
-
-
-Sets = dict[str, list[Members]]
-
-
-@dataclass(frozen=True, eq=False)
-class ElementBlock:
-    """Elements of one type: `numbers` [c]; `nodes` [c, k] numbers of nodes, or names "instance.number" in an
-    assembly."""
-
-    type_name: str
-    kind: str
-    numbers: np.ndarray
-    nodes: np.ndarray | list[list[str]]
-    keyword: Keyword
-
-
-class UsersOwn(NamedTuple):
-    """Elements of a type whose shape is not known (*USER ELEMENT): how many, and the numbers [n] of all their nodes."""
-
-    type_name: str
-    how_many: int
-    nodes: np.ndarray
-    keyword: Keyword
-
-
-@dataclass(eq=False)
-class Content:
-    """Nodes, elements and sets of the deck, of a part, of an instance or of the assembly. Names are in upper case."""
-
-    name: str = ""
-    nodes: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)
-    blocks: list[ElementBlock] = field(default_factory=list)
-    users_own: list[UsersOwn] = field(default_factory=list)
-    node_sets: Sets = field(default_factory=dict)
-    element_sets: Sets = field(default_factory=dict)
-
-
-@dataclass(frozen=True, eq=False)
-class Instance:
-    """A part that is placed: `rotation` [3, 3] and `shift` [3] say where, x -> rotation x + shift."""
-
-    part: Content
-    own: Content
-    rotation: np.ndarray
-    shift: np.ndarray
-
-
-@dataclass(eq=False)
-class Deck:
-    """A deck: all keywords in order, and what they say of the mesh. `written` has names as they were first written;
-    `formulas` are the names of analytical rigid surfaces."""
-
-    path: Path
-    keywords: list[Keyword]
-    root: Content = field(default_factory=Content)
-    parts: dict[str, Content] = field(default_factory=dict)
-    instances: dict[str, Instance] = field(default_factory=dict)
-    written: dict[str, str] = field(default_factory=dict)
-    ignored: Counter[str] = field(default_factory=Counter)
-    left_out: Counter[str] = field(default_factory=Counter)
-    formulas: list[str] = field(default_factory=list)
 
 
 def read_deck(path: Path) -> Deck:
@@ -147,6 +80,8 @@ class _Reader:
             "PART": self._part,
             "INSTANCE": self._instance,
             "ASSEMBLY": self._leave,
+            **dict.fromkeys(("NGEN", "NFILL", "NCOPY"), self._make_nodes),
+            **dict.fromkeys(("ELGEN", "ELCOPY"), self._make_elements),
             **dict.fromkeys(("ENDPART", "ENDASSEMBLY", "ENDINSTANCE"), self._leave),
         }
 
@@ -218,6 +153,8 @@ class _Reader:
             raise keyword.error(f"elements of the type {type_name} are not known here")
         if not kind:
             self.deck.left_out[type_name] += len(keyword.data)
+            firsts = [next(iter(tokens(line)), "") for line in keyword.data]
+            self.content.left_out |= {int(text): type_name for text in firsts if text.isdigit()}
             if name:
                 self.content.element_sets.setdefault(self._key(name), [])
             return
@@ -226,16 +163,49 @@ class _Reader:
         if name:
             self.content.element_sets.setdefault(self._key(name), []).append(Members("", numbers, True))
 
+    def _make_nodes(self, keyword: Keyword) -> None:
+        if self.system is not None and (keyword.name == "NCOPY" or "LINE" in keyword.options):
+            raise keyword.error("beside *SYSTEM it is not understood here: write the nodes out")
+        numbers = nodes_made(keyword, self.content, lambda name: self._numbers_of(keyword, name, False))
+        name = keyword.options.get("NEWSET" if keyword.name == "NCOPY" else "NSET")
+        if name:
+            if keyword.options.get("OLDSET", "").upper() in self.content.unsorted:
+                self.content.unsorted.add(self._key(name))
+            self.content.node_sets.setdefault(self._key(name), []).append(Members("", numbers))
+
+    def _make_elements(self, keyword: Keyword) -> None:
+        name = keyword.options.get("NEWSET" if keyword.name == "ELCOPY" else "ELSET")
+        numbers, left_out = elements_made(keyword, self.content, lambda name: self._numbers_of(keyword, name, True))
+        self.deck.left_out.update(left_out)
+        if name:
+            self.content.element_sets.setdefault(self._key(name), []).append(Members("", numbers, True))
+
+    def _numbers_of(self, keyword: Keyword, name: str, of_elements: bool) -> np.ndarray:
+        """The nodes or elements of a set so far, in its order."""
+        parts = [np.zeros(0, np.int64)]
+        for instance, numbers, are_elements in self._named(keyword, of_elements, "", name):
+            if instance:
+                raise keyword.error(f"the set {name} is of an instance: write the mesh out")
+            if are_elements == of_elements:
+                parts.append(numbers)
+                continue
+            blocks = [block for block in self.content.blocks if isinstance(block.nodes, np.ndarray)]
+            parts += [np.asarray(block.nodes)[np.isin(block.numbers, numbers)].ravel() for block in blocks]
+        together = np.concatenate(parts)
+        return together if name.upper() in self.content.unsorted else np.unique(together)
+
     def _set(self, keyword: Keyword) -> None:
         name = self._key(keyword.required(keyword.name))
         instance = keyword.options.get("INSTANCE", "").upper()
         if instance and instance not in self.deck.instances:
             raise keyword.error(f"there is no instance {keyword.options['INSTANCE']!r}")
         of_elements = keyword.name == "ELSET"
+        if "UNSORTED" in keyword.options and not of_elements:
+            self.content.unsorted.add(name)
         members = self._sets(self.content, of_elements).setdefault(name, [])
         if not of_elements and keyword.options.get("ELSET"):
             members.extend(self._named(keyword, True, instance, keyword.options["ELSET"]))
-        elif "GENERATE" in keyword.options:
+        elif keyword.options.keys() & {"GENERATE", "GEN"}:  # Abaqus reads names that are cut short
             members.append(Members(instance, _generated(keyword), of_elements))
         else:
             members.extend(self._listed(keyword, of_elements, instance))
@@ -253,8 +223,10 @@ class _Reader:
                 if text.lstrip("+-").isdigit():
                     numbers.append(whole(text, line))
                 elif text:
+                    members.append(Members(instance, np.array(numbers, np.int64), of_elements))
+                    numbers = []
                     members.extend(self._named(keyword, of_elements, instance, text.strip('"')))
-        return [Members(instance, np.array(numbers, np.int64), of_elements), *members]
+        return [*members, Members(instance, np.array(numbers, np.int64), of_elements)]
 
     def _named(self, keyword: Keyword, of_elements: bool, instance: str, text: str) -> list[Members]:
         """The members of a set, or a node or an element of an instance; all with the ones that sets have now."""
@@ -313,7 +285,7 @@ def _generated(keyword: Keyword) -> np.ndarray:
                 f"{line.place}: has {counted(len(numbers), 'number')}; must be the first, the last and the step"
             )
         first, last, step = [*numbers, 1][:3]
-        if step < 1 or last < first or (last - first) // step > 10**9:
+        if step == 0 or not 0 <= (last - first) // step <= 10**9:
             raise DatasetError(f"{line.place}: cannot count from {first} to {last} in steps of {step}")
-        parts.append(np.arange(first, last + 1, step))
+        parts.append(first + step * np.arange((last - first) // step + 1))
     return np.concatenate(parts)

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ast_sim.importers.decks.deck_content import Content, Deck, ElementBlock, Members, read_deck
+from ast_sim.importers.decks.deck_content import read_deck
+from ast_sim.importers.decks.deck_parts import Content, Deck, ElementBlock, Members
 from ast_sim.importers.decks.element_types import REVOLVED
 from ast_sim.importers.formats.source_mesh import CellBlock, SourceMesh
 from ast_sim.support.errors import DatasetError, counted

@@ -9,7 +9,7 @@ import numpy as np
 
 from ast_sim.support.errors import DatasetError, counted
 
-_VERSIONS = (1.0, 2.0, 2.1, 2.2, 4.1)
+_VERSIONS = (1.0, 2.0, 2.1, 2.2, 4.0, 4.1)
 
 
 class Section:

@@ -1,7 +1,7 @@
-"""Meshes in the files of Gmsh, `.msh` of the formats 1, 2 and 4.1, as text or binary.
+"""Meshes in the files of Gmsh, `.msh` of the formats 1, 2, 4.0 and 4.1, as text or binary.
 
 Gmsh writes an element once for each of its physical groups in formats 1 and 2; whoever makes elements of the cells
-takes each once. Format 4.1 says the groups of geometric entities, partitioned ones among them, and each block of
+takes each once. Format 4 says the groups of geometric entities, partitioned ones among them, and each block of
 elements belongs to an entity. Source: the reference manual of Gmsh, chapter "File formats".
 """
 
@@ -147,7 +147,7 @@ def _entities(section: Section, content: _Content, partitioned: bool) -> None:
             if partitioned:
                 section.ints(2)  # the entity that it is a part of
                 section.ints(int(section.sizes(1)[0]))
-            section.reals(3 if dimension == 0 else 6)
+            section.reals(3 if dimension == 0 and section.version > 4 else 6)
             groups = section.ints(int(section.sizes(1)[0]))
             content.physical[dimension, number] = np.abs(groups).tolist()
             if dimension:
@@ -155,29 +155,39 @@ def _entities(section: Section, content: _Content, partitioned: bool) -> None:
 
 
 def _nodes_4(section: Section, content: _Content) -> None:
-    blocks, total, _, _ = section.sizes(4).tolist()
+    """Format 4.0 names an entity before its dimension, and gives each node its number and point on one line."""
+    old = section.version < 4.1
+    blocks, total, *_ = section.sizes(2 if old else 4).tolist()
     section.require(total, 8)
     numbers, points = [np.zeros(0, np.int64)], [np.zeros((0, 3))]
     for _ in range(blocks):
-        dimension, _, parametric = section.ints(3).tolist()
+        *entity, parametric = section.ints(3).tolist()
         count = int(section.sizes(1)[0])
-        numbers.append(section.sizes(count))
-        columns = 3 + (dimension if parametric else 0)
-        points.append(section.reals(columns * count).reshape(count, columns)[:, :3])
+        columns = 3 + (entity[1 if old else 0] if parametric else 0)
+        if old:
+            block_numbers, rows = section.records_of_data(count, columns)
+        else:
+            block_numbers = section.sizes(count)
+            rows = section.reals(columns * count).reshape(count, columns)
+        numbers.append(block_numbers)
+        points.append(rows[:, :3])
     content.node_numbers, content.points = np.concatenate(numbers), np.concatenate(points)
     if len(content.node_numbers) != total:
         raise ValueError(f"it says that it holds {counted(total, 'node')}, but there are {len(content.node_numbers):,}")
 
 
 def _elements_4(section: Section, content: _Content) -> None:
-    blocks, total, _, _ = section.sizes(4).tolist()
+    old = section.version < 4.1
+    blocks, total, *_ = section.sizes(2 if old else 4).tolist()
     section.require(total, 8)
     held = 0
     for _ in range(blocks):
-        dimension, entity, kind_number = section.ints(3).tolist()
+        *ids, kind_number = section.ints(3).tolist()
+        dimension, entity = ids[::-1] if old else ids
         kind = _kind(kind_number)
         count = int(section.sizes(1)[0])
-        rows = section.sizes(count * (1 + node_count(kind))).reshape(count, -1)
+        numbers = (section.ints if old else section.sizes)(count * (1 + node_count(kind)))
+        rows = numbers.reshape(count, -1)
         groups = [(dimension, group, np.arange(count)) for group in content.physical.get((dimension, entity), [])]
         first = groups[0][1] if groups else 0
         content.blocks.append(

@@ -7,9 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ast_sim.importers.decks.deck_content import Deck, read_deck
+from ast_sim.importers.decks.deck_content import read_deck
 from ast_sim.importers.decks.deck_mesh import mesh_of_deck
 from ast_sim.importers.decks.deck_numbers import real, refuse_decimal_commas, tokens, whole
+from ast_sim.importers.decks.deck_parts import Deck
 from ast_sim.importers.decks.keyword_lines import Keyword, Line
 from ast_sim.importers.formats.source_mesh import SourceMesh
 from ast_sim.importers.solved_jobs.job_materials import MATERIAL_KEYWORDS, material_columns

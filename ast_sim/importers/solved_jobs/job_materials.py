@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ast_sim.importers.decks.deck_content import Deck
 from ast_sim.importers.decks.deck_numbers import real, refuse_decimal_commas, tokens
+from ast_sim.importers.decks.deck_parts import Deck
 from ast_sim.importers.decks.keyword_lines import Keyword, Line
 from ast_sim.importers.formats.source_mesh import SourceMesh
 from ast_sim.importers.solved_jobs.job_temperatures import node_temperatures

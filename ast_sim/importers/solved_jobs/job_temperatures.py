@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ast_sim.importers.decks.deck_content import Deck
 from ast_sim.importers.decks.deck_numbers import real, refuse_decimal_commas, tokens
+from ast_sim.importers.decks.deck_parts import Deck
 from ast_sim.importers.decks.keyword_lines import Keyword
 from ast_sim.importers.formats.source_mesh import SourceMesh
 

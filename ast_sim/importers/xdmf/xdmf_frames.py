@@ -16,6 +16,14 @@ from ast_sim.importers.formats.source_mesh import SourceMesh, from_meshio
 from ast_sim.importers.meshio_files import by_meshio, what_meshio_says
 from ast_sim.importers.xdmf.xdmf_grids import with_one_grid, with_one_series
 from ast_sim.importers.xdmf.xdmf_items import made_of_others, with_joined_points, write_out
+from ast_sim.importers.xdmf.xdmf_spellings import (
+    with_defaults,
+    with_fields_of_one_step,
+    with_own_times,
+    with_references,
+    with_version,
+    without_time,
+)
 from ast_sim.support.errors import DatasetError, counted
 
 # How the coordinates of points may stand.
@@ -31,7 +39,8 @@ def xdmf_frames(path: Path) -> Iterator[SourceMesh]:
         tree = ET.parse(path)
     except (ET.ParseError, OSError, ValueError, LookupError) as error:
         raise DatasetError(f"{path}: cannot be read as a mesh: it is no XML: {error}") from error
-    several = with_one_series(tree)
+    several = with_version(tree) | with_own_times(path, tree) | with_fields_of_one_step(tree)
+    several |= with_one_series(tree)
     _require_understood(path, tree)
     series = tree.findall("Domain/Grid[@GridType='Collection']")
     version = str(tree.getroot().get("Version"))
@@ -44,14 +53,14 @@ def xdmf_frames(path: Path) -> Iterator[SourceMesh]:
     told = [f"sets are not read: {named}"] if named else []
     several |= not series and len(tree.findall("Domain/Grid")) > 1
     told += [] if series else with_one_grid(path, tree)
-    time, timed = (None, False) if series else _without_time(path, tree)
+    time, timed = (None, False) if series else without_time(path, tree)
     if series:
         _require_plain(path, series)
         _require_no_other(path, tree, series[0])
     changes = [
         several,
-        _with_defaults(tree),
-        _with_references(path, tree),
+        with_defaults(tree),
+        with_references(path, tree),
         timed,
         with_joined_points(tree),
         made_of_others(tree),
@@ -89,50 +98,6 @@ def _require_count(mesh: SourceMesh, topology: ET.Element | None) -> None:
         raise DatasetError(
             f"{mesh.path}: says that it holds {counted(int(said), 'cell')}, but their array has {cells:,}"
         )
-
-
-def _without_time(path: Path, tree: ET.ElementTree[Any]) -> tuple[float | None, bool]:
-    """Take the time out of the grid of a file without a series: meshio refuses it. What it says, and whether there was
-    one."""
-    said = [(grid, time) for grid in tree.iter("Grid") for time in grid.findall("Time")]
-    for grid, time in said:
-        grid.remove(time)
-    try:
-        return (float(said[0][1].attrib["Value"]) if said else None), bool(said)
-    except (KeyError, ValueError) as error:
-        raise DatasetError(f"{path}: the Time of its grid has no Value that is a number") from error
-
-
-def _with_defaults(tree: ET.ElementTree[Any]) -> bool:
-    """Write out what XDMF takes where nothing is said, and meshio needs: uniform grids, fields of nodes. Whether there
-    is such a place."""
-    defaults = [("Grid", "GridType", "Uniform"), ("Attribute", "Center", "Node")]
-    silent = [(one, key, value) for tag, key, value in defaults for one in tree.iter(tag) if one.get(key) is None]
-    for one, key, value in silent:
-        one.set(key, value)
-    return bool(silent)
-
-
-def _with_references(path: Path, tree: ET.ElementTree[Any]) -> bool:
-    """Put what is referred to in the place of each reference; meshio knows them within numbers alone. Whether there is
-    one."""
-    places = [(parent, row) for parent in tree.iter() for row, one in enumerate(parent) if one.get("Reference")]
-    targets = [_referred(path, tree, parent[row]) for parent, row in places]
-    for (parent, row), target in zip(places, targets, strict=True):
-        parent[row] = target
-    return bool(places)
-
-
-def _referred(path: Path, tree: ET.ElementTree[Any], item: ET.Element) -> ET.Element:
-    """What an item refers to, which must not refer to something itself."""
-    named = item.get("Reference", "")
-    named = (item.text or "" if named == "XML" else named).strip()
-    target = None
-    with contextlib.suppress(SyntaxError, KeyError, TypeError):  # no path as ElementTree knows them
-        target = tree.getroot().find("." + (named if named.startswith("//") else named.removeprefix("/Xdmf")))
-    if target is None or target.tag != item.tag or any(one.get("Reference") for one in target.iter()):
-        raise DatasetError(f"{path}: refers to {named!r}, which it does not hold: write it out")
-    return target
 
 
 def _own_mesh(reader: Any, grid: ET.Element, shared: tuple[Any, Any]) -> tuple[Any, Any]:

@@ -2,7 +2,7 @@
 
     HyperSlab     an item with start, stride and count of each axis, and the array that these choose from
     Coordinates   an item with a row of indices for each number, and the array that these choose from
-    Function      JOIN($0, $1, ...): the items as the columns of one array
+    Function      JOIN($0, $1, ...): the items as the columns of one array; 0*$0: a column of zeros
 
 meshio knows plain numbers alone, so the others are written into a file beside a copy of the XDMF file.
 """
@@ -20,6 +20,8 @@ import numpy as np
 from ast_sim.support.errors import DatasetError, counted
 
 _JOIN = re.compile(r"\s*JOIN\s*\(\s*(\$\d+(?:\s*[,;]\s*\$\d+)*)\s*\)\s*", re.IGNORECASE)
+
+_ZEROS = re.compile(r"\s*0\s*\*\s*\$0\s*")
 
 # Coordinates with an array for each axis, and how they are called if they stand in one.
 _APART = {"X_Y_Z": "XYZ", "X_Y": "XY"}
@@ -158,6 +160,8 @@ def _picked(path: Path, numbers: np.ndarray, array: np.ndarray) -> np.ndarray:
 def _joined(path: Path, item: ET.Element, parts: list[ET.Element]) -> np.ndarray:
     """Items as the columns of one array."""
     said = item.get("Function", "")
+    if _ZEROS.fullmatch(said) and len(parts) == 1:
+        return np.zeros_like(_values(path, parts[0]))
     match = _JOIN.fullmatch(said)
     order = [int(number) for number in re.findall(r"\d+", match[1])] if match else []
     shape = _dimensions(item)

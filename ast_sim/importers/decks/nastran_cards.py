@@ -10,6 +10,7 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
+from ast_sim.importers.decks.nastran_axes import NastranPoints
 from ast_sim.importers.formats.source_mesh import INSTEAD
 from ast_sim.support.errors import DatasetError
 
@@ -45,30 +46,25 @@ def plain_nastran(path: Path) -> bytes:
     """A deck of Nastran with the points and elements of a deck, and of the files that it includes, alone.
 
     Raises:
-        DatasetError: it holds points in a system of their own, or elements that are not known, or lacks something; the
-            text names the file and the line.
+        DatasetError: it holds elements that are not known, or lacks something; the text names the file and the line.
     """
-    points = {}
-    cells = []
+    points = NastranPoints(path)
+    cells: list[str] = []
     for place, (card, *fields) in _cards_of_nastran(path):
         name = card.rstrip("_")
-        wrong = ""
-        if name in ("GRID", "GRDSET") and fields[1] not in ("", "0"):
-            wrong = f"a {name} with a coordinate system of its own, and those are not read"
-        elif name.startswith("C") and name not in _ELEMENTS and not _NO_ELEMENTS.match(name):
-            wrong = f"{name} elements, which are not read"
-        if wrong:
-            raise DatasetError(f"{path}: holds {wrong} ({place}): {INSTEAD}")
-        if name == "GRID":
-            points[fields[0]] = ",".join(["GRID", fields[0], "", *(text or "0." for text in fields[2:5])])
+        if name.startswith("C") and name not in _ELEMENTS and not _NO_ELEMENTS.match(name):
+            raise DatasetError(f"{path}: holds {name} elements, which are not read ({place}): {INSTEAD}")
+        if name in ("GRID", "GRDSET") or re.fullmatch("CORD[12][RCS]", name):
+            points.take(place, name, fields)
         elif name in _ELEMENTS:
             cells += _plain_element(path, place, name, fields)
-    if not points:
+    if not points.grids:
         raise DatasetError(f"{path}: cannot be read as a mesh: holds no GRID, so it is no deck of Nastran; {INSTEAD}")
-    missing = {node for row in cells for node in row.split(",")[1 if row[0] == "+" else 3 :]} - points.keys()
+    missing = {node for row in cells for node in row.split(",")[1 if row[0] == "+" else 3 :]} - points.grids.keys()
     if missing:
         raise DatasetError(f"{path}: an element has the node {min(missing)}, and there is no GRID of this number")
-    return "\n".join(["BEGIN BULK", *points.values(), *cells, "ENDDATA\n"]).encode()
+    rows = [",".join(["GRID", number, "", *points.texts(number)]) for number in points.grids]
+    return "\n".join(["BEGIN BULK", *rows, *cells, "ENDDATA\n"]).encode()
 
 
 def _plain_element(path: Path, place: str, name: str, fields: list[str]) -> list[str]:
