@@ -14,7 +14,7 @@
 Make a dataset: `generate`, `convert` with `FieldNames`, or your own simulations with `Scene`, `Trajectory`,
 `DatasetInfo`, `DatasetWriter`. Read it: `Dataset`. Train: `train`, or `new_model` with a loop of your own. Predict and
 evaluate: `Run`, `Answer`, `Evaluation`. Scenes from a mesh: `read_scene`. Motions: `RigidMotion` and `Motion`. Errors
-that you can act on: `AstSimError`.
+that you can act on: `AstSimError` and its kinds, such as `RolloutError`, which has the answer so far.
 
 A name is imported when it is first used, so `import ast_sim` alone does not load torch.
 """

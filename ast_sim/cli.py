@@ -238,7 +238,8 @@ def _add_train(train: Parser) -> None:
     add_each(train, {"--preset P": "ready-made settings; the list is below (default: tiny)"})
     files = {
         "--config FILE": "TOML file with settings, such as config.toml of a run; --set and options override it",
-        "--from RUN": "start with the weights and the settings of another run, to train it longer or on other data",
+        "--from RUN": "start with the weights and the settings of another run (a folder or a .ast file), to train it"
+        " longer or on other data",
     }
     add_each(train, files, type=path)
     states = {"--state NAME": "field of the dataset to predict, such as PEEQ, or reaction; may be repeated"}

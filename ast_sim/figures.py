@@ -14,6 +14,8 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from ast_sim.named_field import REACTION
+from ast_sim.support.errors import ConfigError, nearest_name
+from ast_sim.support.notebook_table import one_line
 
 
 def main_nodes(quantity: str) -> str:
@@ -203,15 +205,34 @@ class Figures:
     field_units: Mapping[str, str] = field(default_factory=dict)
     origin: Mapping[str, Any] = field(default_factory=dict)
 
+    def __repr__(self) -> str:
+        facts = {"scenes": f"{len(self.scenes):,}", "failures": self.failures}
+        for row in self.errors:
+            if (row.predictor, row.horizon, row.nodes) == ("model", "rollout_all", main_nodes(row.quantity)):
+                error = "none" if row.rmse_sequence is None else f"{row.rmse_sequence:.4g} {self.unit(row.quantity)}"
+                facts[f"{row.quantity} error"] = error
+        return one_line("Figures", facts)
+
     def error(
         self, quantity: str, predictor: str = "model", horizon: str = "rollout_all", nodes: str | None = None
     ) -> MeanError | None:
-        """The error over all scenes; None: the predictor predicts no such quantity. `nodes`: the main ones if None."""
+        """The error over all scenes; None: the predictor has none of this quantity. `nodes`: the main ones if None.
+
+        Raises:
+            ConfigError: a name is not known; the text names the nearest.
+        """
         return _row(self.errors, quantity, predictor, horizon, nodes or main_nodes(quantity))
 
     def unit(self, quantity: str) -> str:
-        """The unit of a quantity's errors."""
-        return {"displacement": self.length_unit, "stress": self.stress_unit, **self.field_units}[quantity]
+        """The unit of a quantity's errors.
+
+        Raises:
+            ConfigError: the quantity is not known.
+        """
+        units = {"displacement": self.length_unit, "stress": self.stress_unit, **self.field_units}
+        if quantity not in units:
+            raise ConfigError(f"there is no quantity {quantity!r}{nearest_name(quantity, units)}")
+        return units[quantity]
 
     def relative(self, quantity: str) -> float | None:
         """The model's error of the stress or of a named field over all frames and scenes, over the root mean square of
@@ -228,7 +249,18 @@ class Figures:
 
 
 def _row(rows: Sequence[Any], quantity: str, predictor: str, horizon: str, nodes: str) -> Any:
+    quantities = dict.fromkeys(["displacement", "stress", *(row.quantity for row in rows)])
+    trivial = [f"{name}_{kind}" for name in quantities for kind in ("zero", "constant", "frame_mean")]
+    known = {
+        "quantity": quantities,
+        "predictor": ["model", "hold_still", "repeat_last", *trivial, *(row.predictor for row in rows)],
+        "horizon": ["one_step", "rollout_50", "rollout_all"],
+        "place of nodes": ["normal", "all", "deforming", "prescribed"],
+    }
     wanted = (quantity, predictor, horizon, nodes)
+    for name, (what, names) in zip(wanted, known.items(), strict=True):
+        if name not in names:
+            raise ConfigError(f"there is no {what} {name!r}{nearest_name(name, names)}")
     return next((row for row in rows if (row.quantity, row.predictor, row.horizon, row.nodes) == wanted), None)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from ast_sim.number_arrays import require_array, require_finite
 from ast_sim.support.errors import DatasetError
+from ast_sim.support.notebook_table import one_line
 
 # The name of the nodal reactions, [S, N, 3] in newton: the forces that act on the nodes from outside.
 REACTION = "reaction"
@@ -46,6 +47,10 @@ class NamedField:
     values: np.ndarray
     location: str
     unit: str = ""
+
+    def __repr__(self) -> str:
+        shape = " x ".join(map(str, np.shape(self.values)))
+        return one_line("NamedField", {"at each": self.location, "values": shape, "unit": self.unit or "none"})
 
     def select(self, rows: list[int]) -> NamedField:
         """The frames in these rows."""

@@ -13,6 +13,7 @@ from ast_sim.number_arrays import nodes_of_body, real_numbers
 from ast_sim.scene import Scene
 from ast_sim.support.argument_checks import require_type
 from ast_sim.support.errors import ConfigError, warn
+from ast_sim.support.notebook_table import one_line
 from ast_sim.support.toml_settings import whole
 
 Vector = Sequence[float]
@@ -150,6 +151,10 @@ class Motion:
     """
 
     position: np.ndarray
+
+    def __repr__(self) -> str:
+        frames, nodes = np.shape(self.position)[:2]
+        return one_line("Motion", {"frames": frames, "nodes": f"{nodes:,}"})
 
     @classmethod
     def of_bodies(cls, scene: Scene, motions: Mapping[int, RigidMotion | Vector], frames: int) -> Motion:

@@ -77,7 +77,8 @@ class Bare(str):
 
 
 def bare(annotation: Any) -> Any:
-    """An annotation that is kept as text, as it stands in the source."""
+    """An annotation that is kept as text, as it stands in the source; the ones of a `NamedTuple` are `ForwardRef`s."""
+    annotation = getattr(annotation, "__forward_arg__", annotation)
     return Bare(annotation) if isinstance(annotation, str) else annotation
 
 

@@ -92,7 +92,7 @@ def test_the_effort_of_a_run_is_checked_where_it_is_set(trained, tmp_path):
     before = run.effort
     for effort in (5, None, "exact", Effort):
         refused(lambda effort=effort: setattr(run, "effort", effort), "it must be an Effort, such as")
-    refused(lambda: setattr(run, "effort", Effort.exact()), "an exact answer needs")
+    refused(lambda: setattr(run, "effort", Effort.exact()), "this run can give no exact answer")
     assert run.effort == before
     run.effort = Effort(2)
     run.save(tmp_path / "run.ast")

@@ -13,6 +13,10 @@ from meshes import two_tetrahedra
 import ast_sim
 from ast_sim import Dataset, Scene, scene_summary
 from ast_sim.inference.answer import Answer
+from ast_sim.mechanics.driven import Driven
+from ast_sim.named_field import NamedField
+from ast_sim.support.notebook_table import html_bars
+from ast_sim.trade_figures import Setting, TradeFigures
 
 TRUTH = toy.plate()
 
@@ -97,3 +101,44 @@ def test_an_answer_is_a_table_and_a_picture_if_matplotlib_is_there(monkeypatch, 
     assert ("data:image/png;base64,iVBOR" in shown) == extra
     assert "&lt;b&gt;toy" in shown and "<b>toy" not in shown
     assert "<th" in answer(position=TRUTH.position[:0], stress=None, frames=(), failure="too far")._repr_html_()
+
+
+def test_what_holds_arrays_shows_one_line(tmp_path):
+    """Numbers of arrays, and addresses of objects, tell nothing."""
+    field = NamedField(np.zeros((2, 48, 3), np.float32), "node", "N")
+    shown = answer(driven=Driven.of(TRUTH.scene, TRUTH.position), fields={"reaction": field})
+    travel = np.linalg.norm(TRUTH.position - TRUTH.position[0], axis=2)[:, TRUTH.scene.body == 1].max()
+    assert repr(shown.driven) == f"Driven(body: 1, nodes: 8 of 48, frames: 7, largest travel: {travel:.4g})"
+    assert repr(field) == "NamedField(at each: node, values: 2 x 48 x 3, unit: N)"
+    moved = np.linalg.norm(TRUTH.position[3] - TRUTH.scene.rest_position, axis=1).max()
+    assert repr(shown.frame(3)) == (
+        f"AnsweredFrame(number: 3, time: {shown.frame(3).time:.4g} s, nodes: 48, largest displacement: {moved:.4g},"
+        f" largest stress: {TRUTH.stress[3].max():.4g} Pa, fields: reaction)"
+    )
+    rows = [{"travel": 1.0}, {"travel": 2.0, "last_newton_step": 1.0}, {"travel": 3.0, "failure": "too far"}]
+    assert repr(ast_sim.Sweep(rows, ("travel",), "mm", 0.5)) == (
+        "Sweep(rows: 3, varied: travel, failed: 1, not converged: 1, seconds: 0.5)"
+    )
+    assert repr(ast_sim.Motion(TRUTH.position)) == "Motion(frames: 7, nodes: 48)"
+    assert repr(trade()) == "Trade(scenes: 3, errors of: displacement)"
+    with pytest.raises(ast_sim.RolloutError, match="no frame -1; it has: 0, 3; a negative number does not count from"):
+        shown.plot(-1)
+
+
+def trade() -> ast_sim.Trade:
+    setting = Setting("one call", (0.1, 0.2, 0.3), (1.0, 1.0, 1.0))
+    return ast_sim.Trade({"displacement": TradeFigures(("a", "b", "c"), (setting,), (), "why not")})
+
+
+def test_a_dataset_and_a_split_show_their_first_scene(tmp_path):
+    with Dataset(toy.write(tmp_path / "d.h5", (0, 0, 2))) as data:
+        split = data["test"]
+        assert data._repr_html_().count("<svg") == split._repr_html_().count("<svg") == 1
+        assert split[1].scene._repr_html_() in split[1:]._repr_html_()
+        assert "<svg" not in data["train"]._repr_html_()
+    assert "<svg" not in data._repr_html_() and "<svg" not in split._repr_html_()
+
+
+def test_bars_are_as_high_as_their_values():
+    bars = ElementTree.fromstring(re.search("<svg.*</svg>", html_bars([1.0, 4.0, 0.0], "<e>"))[0])
+    assert [bar.get("height") for bar in bars] == ["25", "100", "0"] and "&lt;e&gt;" in html_bars([], "<e>")

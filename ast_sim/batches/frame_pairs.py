@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,14 +14,38 @@ from torch.utils.data import Dataset as TorchDataset
 from ast_sim.dataset.layout import GIVEN_FRAMES
 from ast_sim.dataset.reader import Dataset
 from ast_sim.ops import join_indices
-from ast_sim.support.argument_checks import require_type
-from ast_sim.support.errors import DatasetError
+from ast_sim.support.argument_checks import require_type, several
+from ast_sim.support.errors import ConfigError, DatasetError
+from ast_sim.support.notebook_table import one_line
 
 
 def target_counts(dataset: Dataset, split: str) -> list[int]:
     """How many frames of each trajectory of a split can be predicted: all but the given ones."""
     given = GIVEN_FRAMES[dataset.info.integration]
     return [max(0, dataset.num_frames(split, index) - given) for index in range(dataset.count(split))]
+
+
+def place_of(number: int, count: int) -> int:
+    """The place of an item of `count`, from 0; negative numbers count from the end. The IndexError where there is none
+    ends a loop over all."""
+    try:
+        return range(count)[operator.index(number)]
+    except IndexError:
+        raise IndexError(f"there is no item {number}: there are {count:,}") from None
+
+
+def to_collate(items: Any, types: type | tuple[type, ...], what: str) -> list[Any]:
+    """The items that are to become one batch, each of these types, which `what` says in words.
+
+    Raises:
+        ConfigError: there are none, or one is of another type.
+    """
+    listed = several("items", items, f"{what}s")
+    if not listed:
+        raise ConfigError(f"items is empty; a batch needs one {what} or more")
+    for number, item in enumerate(listed):
+        require_type(f"item {number}", item, types, f"one {what}")
+    return listed
 
 
 class FramePairs(TorchDataset[dict[str, Tensor]]):
@@ -55,11 +80,16 @@ class FramePairs(TorchDataset[dict[str, Tensor]]):
         if not len(self):
             raise DatasetError(f"{dataset.path}: no trajectory of {split} has {self._given + 1} frames")
 
+    def __repr__(self) -> str:
+        return one_line(
+            "FramePairs", {"pairs": f"{len(self):,}", "split": self._split, "file": self._dataset.path.name}
+        )
+
     def __len__(self) -> int:
         return int(self._starts[-1])
 
     def __getitem__(self, number: int) -> dict[str, Tensor]:
-        number = range(len(self))[operator.index(number)]  # an IndexError where there is none ends a loop over all
+        number = place_of(number, len(self))
         index = int(np.searchsorted(self._starts, number, side="right")) - 1
         frame = self._given + number - int(self._starts[index])
         scene = self._dataset.scene(self._split, index)
@@ -83,7 +113,19 @@ class FramePairs(TorchDataset[dict[str, Tensor]]):
     @staticmethod
     def collate(items: Sequence[dict[str, Tensor]]) -> dict[str, Tensor]:
         """Several items as one, without padding: the rows of all items one after another. The elements count the nodes
-        of the whole batch. `scene` [N] int64 is the item that each node belongs to."""
+        of the whole batch. `scene` [N] int64 is the item that each node belongs to.
+
+        Raises:
+            ConfigError: there are no items, or they are not of one kind.
+        """
+        items = to_collate(items, Mapping, "item of FramePairs")
+        kinds = [{name: tuple(values.shape[1:]) for name, values in item.items()} for item in items]
+        for number, kind in enumerate(kinds):
+            if "position" not in kind or kind != kinds[0]:
+                shown = ", ".join(f"{name} {['rows', *shape]}".replace("'", "") for name, shape in kind.items())
+                raise ConfigError(
+                    f"item {number} is no item of FramePairs, or of another dataset than item 0; it has: {shown}"
+                )
         nodes = [len(item["position"]) for item in items]
         batch = {name: torch.cat([item[name] for item in items]) for name in items[0]}
         batch["elements"] = join_indices([item["elements"] for item in items], nodes)

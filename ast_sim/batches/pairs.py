@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ast_sim.batches.batch_builder import Batch, State, Target
 from ast_sim.batches.carry import Carrier
+from ast_sim.batches.frame_pairs import place_of, to_collate
 from ast_sim.batches.graph import Graph
 from ast_sim.batches.mirror_and_shift import Placement
 from ast_sim.batches.scheme import Scheme
@@ -20,8 +21,10 @@ from ast_sim.batches.torch_settings import tensors_on_cpu
 from ast_sim.dataset.reader import Dataset
 from ast_sim.named_field import STRESS, require_fields
 from ast_sim.scene import Scene
+from ast_sim.support.argument_checks import in_short
 from ast_sim.support.byte_cache import ByteCache, cache_bytes
-from ast_sim.support.errors import DatasetError
+from ast_sim.support.errors import ConfigError, DatasetError
+from ast_sim.support.notebook_table import one_line
 
 # The order, the noise and the placements draw from separate sequences of random numbers.
 _ORDER, _NOISE, _PLACE = 0, 1, 2
@@ -171,17 +174,30 @@ class PairSampler:
     def __len__(self) -> int:
         return self.num_pairs
 
+    def __repr__(self) -> str:
+        return one_line(
+            "PairSampler", {"pairs": f"{len(self):,}", "split": self._split, "file": self._dataset.path.name}
+        )
+
     def __getitem__(self, number: int) -> tuple[Batch, Target]:
         """One pair of all, as a batch of its own. Its noise and its placement are new at each call; the seed of torch
         determines them."""
-        number = range(len(self))[number]  # an IndexError where there is none ends a loop over all
+        number = place_of(number, len(self))
         return self._built(self._pair(int(torch.randint(_LARGEST_SEED, (), device="cpu")), number))
 
     @staticmethod
     @tensors_on_cpu()
     def collate(pairs: Sequence[tuple[Batch, Target]]) -> tuple[Batch, Target]:
-        """Several pairs as one batch."""
-        batches, targets = zip(*pairs, strict=True)
+        """Several pairs as one batch.
+
+        Raises:
+            ConfigError: there are none, or one is no pair of a batch and a target.
+        """
+        listed = to_collate(pairs, tuple, "pair of a batch and a target")
+        for number, pair in enumerate(listed):
+            if [type(one) for one in pair] != [Batch, Target]:
+                raise ConfigError(f"item {number} is {in_short(pair)}; it must be one pair of a batch and a target")
+        batches, targets = zip(*listed, strict=True)
         return Batch.concatenate(batches), Target.concatenate(targets)
 
     @property

@@ -30,7 +30,7 @@ from ast_sim.dataset.layout import (
     numbering,
     require_kind,
 )
-from ast_sim.dataset.split import Split
+from ast_sim.dataset.split import Split, first_scene
 from ast_sim.material import Material
 from ast_sim.named_field import NamedField
 from ast_sim.number_arrays import require_finite, require_numbering
@@ -94,7 +94,7 @@ class Dataset:
         return one_line("Dataset", self._facts())
 
     def _repr_html_(self) -> str:
-        return html_table("Dataset", self._facts())
+        return html_table("Dataset", self._facts(), first_scene(self[split] for split in self.splits))
 
     def __getitem__(self, split: str) -> Split:
         """The trajectories of a split: `dataset["test"][0]`."""

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, overload
 
 from ast_sim.scene import Trajectory
-from ast_sim.support.errors import counted
+from ast_sim.support.errors import AstSimError, counted
 from ast_sim.support.notebook_table import html_table, one_line
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ class Split(Sequence[Trajectory]):
         return one_line("Split", self._facts())
 
     def _repr_html_(self) -> str:
-        return html_table("Split", self._facts())
+        return html_table("Split", self._facts(), first_scene([self]))
 
     def __len__(self) -> int:
         return len(self._indices)
@@ -46,3 +46,14 @@ class Split(Sequence[Trajectory]):
         cauchy_stress = self._dataset.cauchy_stress(self.name, number)
         fields = self._dataset.fields(self.name, number)
         return replace(self._dataset.load(self.name, number), cauchy_stress=cauchy_stress, fields=fields)
+
+
+def first_scene(splits: Iterable[Split]) -> str:
+    """The first scene of these splits in HTML; empty if there is none, or it cannot be read any more."""
+    for split in splits:
+        if len(split):
+            try:
+                return split[0].scene._repr_html_()
+            except AstSimError:
+                return ""
+    return ""

@@ -6,12 +6,13 @@ import io
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ast_sim.dataset.layout import DatasetInfo
 from ast_sim.dataset.writer import DatasetWriter
+from ast_sim.inference.quantities.answered_frame import AnsweredFrame
 from ast_sim.inference.quantities.band import LEVEL, Band, how_far
 from ast_sim.inference.quantities.forces_and_figures import (
     BodyForce,
@@ -42,26 +43,6 @@ if TYPE_CHECKING:
 SUFFIXES = (".h5", ".pvd", ".vtkhdf", ".csv")
 
 
-class AnsweredFrame(NamedTuple):
-    """One frame of an answer.
-
-    Attributes:
-        number: its number in the motion of the question.
-        time: in seconds; None: it is not known.
-        position: [N, 3].
-        displacement: [N, 3], from the positions at rest.
-        stress: [N or E], von Mises stress in pascal, or None.
-        fields: [N or E, *], the named fields that the model predicts, by name.
-    """
-
-    number: int
-    time: float | None
-    position: np.ndarray
-    displacement: np.ndarray
-    stress: np.ndarray | None
-    fields: dict[str, np.ndarray]
-
-
 @dataclass(frozen=True, eq=False)
 class Answer:
     """The S wanted frames of a prediction, in the order in which they were named. After a failure some are missing.
@@ -89,7 +70,8 @@ class Answer:
         driven: the prescribed nodes that move farthest together in the whole motion.
         law: the law of the material and of contact, as the run knows it.
         fields: the named fields that the model predicts, [S, N or E, *] each with its unit; a given frame holds zero,
-            or what was given. Newton steps do not change them.
+            or what was given. Newton steps leave "reaction" out, since forces then follow from positions (`reaction`,
+            `body_forces`); they do not change the others.
         bands: of each quantity, as `band` takes them.
     """
 
@@ -158,14 +140,16 @@ class Answer:
         return self.position - self.scene.rest_position
 
     def frame(self, number: int) -> AnsweredFrame:
-        """The frame with this number in the motion of the question.
+        """The frame with this number in the motion of the question, which counts from 0; none counts from the end.
 
         Raises:
             ConfigError, RolloutError: it is no whole number; or the answer lacks it, and the text says what it has.
         """
         if required_whole(number=number)[0] not in self.frames:
             known = ", ".join(map(str, self.frames[:20])) + (", ..." if len(self.frames) > 20 else "")
-            raise RolloutError(f"{self.name}: the answer has no frame {number}; it has: {known or 'none'}", self)
+            from_end = "; a negative number does not count from the end here" if number < 0 else ""
+            told = f"the answer has no frame {number}; it has: {known or 'none'}{from_end}"
+            raise RolloutError(f"{self.name}: {told}", self)
         return self._frame(self.frames.index(number))
 
     def _frame(self, row: int) -> AnsweredFrame:
@@ -217,7 +201,8 @@ class Answer:
 
     @property
     def converged(self) -> bool | None:
-        """Whether the last Newton step of every frame was at most 0.05; None without Newton steps."""
+        """Whether the last Newton step of every frame was at most 0.05; None without Newton steps. The stop test of
+        the solver, which is about forces (`check`), is stricter: `Effort.exact` goes on to it."""
         return max(self.last_steps) <= STILL if self.last_steps else None
 
     @property
@@ -248,8 +233,8 @@ class Answer:
     def reaction(self) -> np.ndarray:
         """[S, 3] the force in newton on the prescribed nodes `driven`.
 
-        If the model predicts nodal reactions (`fields["reaction"]`), it is their sum. Without them, and after Newton
-        steps, it follows from the strains of the positions, if the law of the material is known and elastic: the law of
+        If the answer has nodal reactions (`fields["reaction"]`), it is their sum. Without them, as after Newton steps,
+        it follows from the strains of the positions, if the law of the material is known and elastic: the law of
         the bundled solver. Where Newton steps have ended, what touches held nodes beside free ones counts, too.
 
         Raises:
@@ -270,18 +255,19 @@ class Answer:
         return self.bands[quantity].around(self, quantity) if quantity in self.bands else None
 
     def errors(self, truth: Trajectory) -> dict[str, float]:
-        """Relative errors of the last frame of the answer, where a simulation is known.
+        """Relative errors where a simulation is known: in the deepest frame, the one of the predicted frames that both
+        have in which the simulation is displaced most.
 
         Args:
-            truth: a simulation of the same motion, which has frame 0 and this one; something is displaced in it.
+            truth: a simulation of the same motion, which has frame 0.
 
         Returns:
             "displacement": the root mean square error of the free nodes over the root mean square displacement;
             "reaction": the distance of the forces on the moved body over the true force; "stress": by how much the
-            largest stress is off, over the true one. The last two are missing where there is none.
+            largest stress is off, over the true one. The last two are missing where there is none, or it is 0.
 
         Raises:
-            AstSimError: the truth is of another scene, motion or unit, or lacks a frame; or nothing is displaced.
+            AstSimError: the truth is of another scene, motion or unit; they share no frame; or nothing is displaced.
         """
         return errors_of(self, truth)
 
@@ -337,7 +323,7 @@ class Answer:
         path = file_name(path, "path")
         if path.suffix not in SUFFIXES:
             raise AstSimError(f"{path}: the name of a prediction must end in one of {', '.join(SUFFIXES)}")
-        require_same_motion(self, truth)
+        require_same_motion(self, truth, self.frames)
         if self.info is None:
             raise AstSimError(f"{path}: this answer has no units: save one of Run.predict or Run.evaluate")
         make_folder(path.parent)

@@ -19,7 +19,7 @@ from ast_sim.inference.promises.familiarity import Familiarity
 from ast_sim.inference.promises.kept_errors import DISPLACEMENT, KeptErrors
 from ast_sim.inference.promises.known_weights import require_known_weights
 from ast_sim.inference.quantities.band import LEVEL, Comparison, compared
-from ast_sim.inference.quantities.relative_errors import judging_fields, moves
+from ast_sim.inference.quantities.relative_errors import QUANTITIES, judging_fields, moves
 from ast_sim.inference.trained_run import Run
 from ast_sim.runs.scope import spacing_of
 from ast_sim.scene import Trajectory
@@ -63,7 +63,7 @@ def calibrate(
     with run.open(data) as dataset:
         require_new_scenes(run, dataset, split)
         run.folder.require_best()  # which will keep the result
-        require_known_weights(run)
+        require_known_weights(run, "calibrate")
         before = run.calibration
         run.calibration = None  # it has no say in which scenes count
         try:
@@ -195,11 +195,11 @@ def _measured_scene(
 
 
 def _kept_errors(efforts: Sequence[Effort], errors: Sequence[Sequence[Mapping[str, float] | None]]) -> KeptErrors:
-    """The errors by quantity, effort and scene; None, where the prediction failed, is infinite."""
-    known = [one for of_scenes in errors for one in of_scenes if one is not None]
-    shared = [quantity for quantity in (known[0] if known else ()) if all(quantity in one for one in known)]
+    """The errors by quantity, effort and scene; infinite where the prediction failed, which is None, or where the true
+    quantity is 0."""
     by_quantity = {
-        quantity: tuple(tuple(math.inf if one is None else one[quantity] for one in of_scenes) for of_scenes in errors)
-        for quantity in shared
+        quantity: tuple(tuple((one or {}).get(quantity, math.inf) for one in of_scenes) for of_scenes in errors)
+        for quantity in QUANTITIES
+        if any(quantity in one for of_scenes in errors for one in of_scenes if one is not None)
     }
     return KeptErrors(tuple(efforts), by_quantity)

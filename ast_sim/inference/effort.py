@@ -101,11 +101,9 @@ class Effort:
 
     def check(self, config: ModelConfig) -> None:
         """Raise ConfigError if the model cannot make this effort."""
-        if self.solved and not can_be_solved(config):
-            raise ConfigError(
-                "an exact answer needs a run that jumps, tetrahedra, a known law of the material, and the range of"
-                " contact that the solver recorded with the dataset"
-            )
+        lacks = _lacks_for_solver(config) if self.solved else []
+        if lacks:
+            raise ConfigError(f"this run can give no exact answer: {'; '.join(lacks)}")
         for key, count in self._counts.items():
             if count and not config.scheme.corrects:
                 raise ConfigError(f"{key} is {count}; it needs a run that jumps, and this one does not")
@@ -220,7 +218,20 @@ def can_make_newton_steps(config: ModelConfig) -> bool:
 
 def can_be_solved(config: ModelConfig) -> bool:
     """Whether the solver can end an answer: the range of contact must be known, too."""
-    return can_make_newton_steps(config) and config.data.contact_range > 0
+    return not _lacks_for_solver(config)
+
+
+def _lacks_for_solver(config: ModelConfig) -> list[str]:
+    """What keeps the solver from ending an answer."""
+    lacks = [] if config.scheme.corrects else ["its model does not jump"]
+    lacks += [] if config.data.tetrahedra else ["its elements are no tetrahedra"]
+    try:
+        config.data.material.require_law()
+    except ConfigError as error:
+        lacks.append(str(error))
+    if config.data.contact_range <= 0:
+        lacks.append("the range of contact is not known, which the bundled solver records with the scenes it makes")
+    return lacks
 
 
 def choices(config: ModelConfig, corrections: int) -> tuple[Effort, ...]:

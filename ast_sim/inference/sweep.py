@@ -18,6 +18,7 @@ from ast_sim.runs.scope import Scope
 from ast_sim.simulate.own_assembly.parameters import flattened
 from ast_sim.support.argument_checks import file_name
 from ast_sim.support.errors import ConfigError, counted, warn
+from ast_sim.support.notebook_table import one_line
 from ast_sim.support.progress import Progress, ShowProgress
 from ast_sim.view import sweep_files
 from ast_sim.view.files import make_folder
@@ -42,6 +43,12 @@ class Sweep:
     varied: tuple[str, ...]
     length_unit: str
     seconds: float
+
+    def __repr__(self) -> str:
+        facts = {"rows": f"{len(self.rows):,}", "varied": ", ".join(self.varied) or "nothing"}
+        failed = sum("failure" in row for row in self.rows)
+        facts |= {"failed": failed, "not converged": self.not_converged, "seconds": f"{self.seconds:.3g}"}
+        return one_line("Sweep", facts)
 
     @property
     def not_converged(self) -> int:

@@ -31,6 +31,7 @@ from ast_sim.simulate.jobs.recipe import recipe_of
 from ast_sim.support.argument_checks import file_name, in_short, require_type, several
 from ast_sim.support.disk import write_json
 from ast_sim.support.errors import ConfigError, SimulationError
+from ast_sim.support.notebook_table import one_line
 from ast_sim.support.progress import Progress, ShowProgress
 from ast_sim.support.provenance import provenance
 from ast_sim.support.toml_settings import required_whole
@@ -59,6 +60,9 @@ class Trade:
     def figures(self) -> TradeFigures:
         """The figures of the error of the displacement."""
         return self.by_quantity["displacement"]
+
+    def __repr__(self) -> str:
+        return one_line("Trade", {"scenes": len(self.figures.scenes), "errors of": ", ".join(self.by_quantity)})
 
     def __str__(self) -> str:
         return "\n".join(line for figures in self.by_quantity.values() for line in figures.lines())
@@ -311,8 +315,7 @@ def _on_finer_mesh(scenes: _Scenes, variants: Mapping[str, Sequence[_Timed]]) ->
 def timed_answer(
     model: Simulator, dataset: Dataset, split: str, index: int, effort: Effort, fields: Sequence[str] = ()
 ) -> tuple[dict[str, float], float, str | None]:
-    """The errors of an answer at the deepest frame by quantity, its processor seconds, and why it failed: it has no
-    errors and infinite seconds then.
+    """The errors of an answer at the deepest frame by quantity, its processor seconds (infinite if it failed), and why.
 
     The scene is loaded again, so nothing is prepared for its mesh; with these named fields, by which the force is
     judged.

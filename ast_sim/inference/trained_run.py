@@ -29,7 +29,7 @@ from ast_sim.inference.sweep import Sweep, sweep
 from ast_sim.number_arrays import percent
 from ast_sim.runs import run_file
 from ast_sim.scene import Scene, Trajectory
-from ast_sim.simulate.own_assembly.grid import grid, read_table
+from ast_sim.simulate.own_assembly.grid import require_values, rows_of
 from ast_sim.support.argument_checks import file_name, require_bool, require_type, several
 from ast_sim.support.errors import ConfigError, RolloutError, warn
 from ast_sim.support.notebook_table import html_table, one_line
@@ -172,6 +172,8 @@ class Run:
         if spec is not None:
             if not (scene is None and motion is None and stress is None):
                 raise ConfigError("a specification gives the scene and the motion: leave scene, motion and stress out")
+            if parameters is not None:
+                require_values("parameters", parameters)
             (built,) = ask(spec, [parameters or {}], self.scope, self.folder.specification, num_frames, nodes)
             scene, motion, facts, notes = built.scene, built.motion, built.facts, built.notes
             num_frames = None
@@ -205,10 +207,7 @@ class Run:
             ConfigError: as for `predict`; or values and a table are both given.
             SimulationError: a scene cannot be made.
         """
-        if table is not None and parameters:
-            raise ConfigError("a table has the values of all parameters: leave the others out, or leave the table out")
-        rows = table if table is not None else grid(parameters or {})
-        rows = rows if isinstance(rows, Sequence) and not isinstance(rows, str) else read_table(rows)
+        rows = rows_of(parameters, table)
         chosen, _ = chosen_effort(self, [], effort, error)
         model, trained = self.settings.model, self.folder.specification
         return sweep(self.predict_scenes, model, self.scope, trained, spec, rows, chosen, error, nodes, progress)

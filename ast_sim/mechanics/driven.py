@@ -17,6 +17,7 @@ import numpy as np
 
 from ast_sim.element_topology import LOCAL_EDGES
 from ast_sim.scene import NodeType, Scene
+from ast_sim.support.notebook_table import one_line
 
 RIGID = 1e-3  # nodes follow a motion if they are no farther off, as a share of the largest displacement
 TURNED = 1e-4  # radian; below, a motion is a translation: positions in single precision know no better
@@ -48,6 +49,11 @@ class Driven:
     body: int
     nodes: np.ndarray
     path: np.ndarray
+
+    def __repr__(self) -> str:
+        travel = np.linalg.norm(self.path - self.path[:1], axis=2).max(initial=0.0)
+        facts = {"body": self.body, "nodes": f"{int(self.nodes.sum()):,} of {len(self.nodes):,}"}
+        return one_line("Driven", {**facts, "frames": len(self.path), "largest travel": f"{travel:.4g}"})
 
     @staticmethod
     def of(scene: Scene, prescribed_position: np.ndarray) -> Driven:

@@ -155,7 +155,10 @@ def check_physics(
 
     depths, volumes = zip(*overlaps, strict=True) if overlaps else ((), ())
     residuals, imbalances = zip(*forces, strict=True) if forces else ((), ())
-    residual = "the worst force is {:.3g} times what the solver accepts"
+    residual = (
+        "the worst force is {:.3g} times what the solver accepts, whose test is stricter than `converged`: that is only"
+        " about the size of the last Newton step"
+    )
     if law and forces and law.friction(scene):
         residual += "; with friction, its own frames have up to some 100,000"
     inside_out = counted(int(max(turned, default=0)), "element is", "elements are")

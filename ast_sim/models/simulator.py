@@ -21,6 +21,7 @@ from ast_sim.models.model_config import ModelConfig
 from ast_sim.models.normalizer import Normalizer
 from ast_sim.named_field import REACTION, STRESS, Output
 from ast_sim.scene import Scene
+from ast_sim.support.argument_checks import require_type
 from ast_sim.support.errors import ConfigError
 from ast_sim.support.toml_settings import known
 
@@ -149,7 +150,12 @@ class Simulator(nn.Module):
         Args:
             batch_size: of `batch`; a DataLoader has its own.
             options: seed (0 by default), noise (0), gamma (1), mirror, shift, scenes and part, as of `PairSampler`.
+
+        Raises:
+            ConfigError: `dataset` is no open dataset.
+            DatasetError: the split has no pair of frames.
         """
+        require_type("dataset", dataset, Dataset, "an open ast_sim.Dataset")
         options = {"seed": 0, "noise": 0.0, "gamma": 1.0, **options, "batch_size": batch_size}
         of_model = {"make_graph": self.graph, "scheme": self.config.scheme, "fields": self.config.data.fields}
         return PairSampler(dataset, split, **of_model, **options)

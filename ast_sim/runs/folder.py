@@ -8,13 +8,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from torch import Tensor
-
 from ast_sim.dataset.reader import Dataset
 from ast_sim.models.registry import trained_model
 from ast_sim.models.simulator import Simulator
 from ast_sim.runs import checkpoint
-from ast_sim.runs.config_toml import has_config, read_config, read_origin, read_scope
+from ast_sim.runs.config_toml import read_config, read_origin, read_scope
 from ast_sim.runs.metrics import Metrics
 from ast_sim.runs.scope import Scope
 from ast_sim.runs.train_config import RunConfig
@@ -144,20 +142,6 @@ class RunFolder:
         path, step, _ = self.chosen
         checkpoint.load(path, self.origin["sha256"])
         return {"run": str(self.path.resolve()), "step": step, "sha256": checkpoint.weights_hash(path)}
-
-    def first_weights(self) -> dict[str, Tensor] | None:
-        """The weights that the run starts from; None if it does not start from another run.
-
-        Raises:
-            CheckpointError: the checkpoint is gone, damaged, or not the one that the run recorded.
-        """
-        start = self.origin.get("start") if has_config(self.path) else None  # a loop of one's own may have no settings
-        if start is None:
-            return None
-        path = checkpoint.at_step(start["run"], start["step"])
-        if checkpoint.weights_hash(path) != start["sha256"]:
-            raise CheckpointError(f"{path} is not the checkpoint that {self.path} starts from: train in another folder")
-        return checkpoint.load(path)[0]
 
     def require_fit(self, dataset: Dataset) -> None:
         """Raise ConfigError unless the dataset is of the kind that the run was trained on."""

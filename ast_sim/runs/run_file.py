@@ -24,10 +24,13 @@ from typing import Any
 
 import safetensors.torch
 from safetensors import SafetensorError
+from torch import Tensor
 
 import ast_sim
 from ast_sim.models.registry import trained_model
 from ast_sim.models.simulator import Simulator
+from ast_sim.runs import checkpoint
+from ast_sim.runs.config_toml import has_config
 from ast_sim.runs.folder import Chosen, RunFolder
 from ast_sim.runs.metrics import METRICS, Metrics
 from ast_sim.runs.model_card import card
@@ -102,9 +105,18 @@ class RunFile(RunFolder):
     def require_best(self) -> None:
         """A file has one checkpoint, which is the best one."""
 
+    @property
+    def arrays(self) -> dict[str, Tensor]:
+        """The weights and scales of the model."""
+        return safetensors.torch.load(self._members[_WEIGHTS])
+
+    def start(self) -> dict[str, Any]:
+        sha256 = hashlib.sha256(self._members[_WEIGHTS]).hexdigest()
+        return {"run": str(self.path.resolve()), "step": self.chosen.step, "sha256": sha256}
+
     def load_model(self) -> Simulator:
         try:
-            return trained_model(self.settings.model, safetensors.torch.load(self._members[_WEIGHTS]))
+            return trained_model(self.settings.model, self.arrays)
         except (SafetensorError, RuntimeError) as error:
             why = " ".join(str(error).split())
             raise CheckpointError(f"{self.path}: the weights do not fit the settings: {why}") from error
@@ -138,8 +150,30 @@ class _KeptMetrics(Metrics):
 
 
 def open_run(path: Path) -> RunFolder:
-    """The run in a folder, or in a file that `write` made."""
+    """The run in a folder, or in a file that `write` made.
+
+    Raises:
+        CheckpointError: there is neither; or as `RunFile`.
+    """
+    if not path.exists():
+        raise CheckpointError(f"{path}: there is no such file or folder")
     return RunFile(path) if path.is_file() else RunFolder(path)
+
+
+def first_weights(run: RunFolder) -> dict[str, Tensor] | None:
+    """The weights that a run starts from; None if it does not start from another run.
+
+    Raises:
+        CheckpointError: the checkpoint or the file is gone, damaged, or not the one that the run recorded.
+    """
+    start = run.origin.get("start") if has_config(run.path) else None  # a loop of one's own may have no settings
+    if start is None:
+        return None
+    file = RunFile(Path(start["run"])) if Path(start["run"]).is_file() else None
+    path = checkpoint.at_step(start["run"], start["step"]) if file is None else file.path
+    if start["sha256"] != (checkpoint.weights_hash(path) if file is None else file.start()["sha256"]):
+        raise CheckpointError(f"{path} is not the checkpoint that {run.path} starts from: train in another folder")
+    return checkpoint.load(path)[0] if file is None else file.arrays
 
 
 def write(path: Path, run: RunFolder, model: Simulator, effort: Mapping[str, Any], licence: str | None = None) -> None:

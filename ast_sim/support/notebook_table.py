@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any
 
@@ -24,6 +24,17 @@ def html_table(title: str, facts: Mapping[str, Any], picture: str = "") -> str:
     if not picture:
         return table
     return f'<div style="display:flex;align-items:center;gap:1em"><div>{table}</div><div>{picture}</div></div>'
+
+
+def html_bars(values: Sequence[float], title: str) -> str:
+    """Bars in SVG, the highest 100 pixels high, with a title."""
+    largest = max(values, default=0.0) or 1.0
+    heights = [round(100 * value / largest, 1) for value in values]
+    bars = "".join(
+        f'<rect x="{8 * place}" y="{100 - height:g}" width="6" height="{height:g}" fill="#4c8bc9"/>'
+        for place, height in enumerate(heights)
+    )
+    return f'<div>{escape(title)}</div><svg width="{8 * len(heights)}" height="100">{bars}</svg>'
 
 
 def html_picture(png: bytes, width: int) -> str:

@@ -8,6 +8,7 @@ from typing import Any
 
 from ast_sim.support.argument_checks import file_name
 from ast_sim.support.errors import require
+from ast_sim.support.notebook_table import one_line
 from ast_sim.view.files import make_folder
 
 Callback = Callable[[int, dict[str, float]], None]
@@ -50,7 +51,11 @@ class TensorBoard:
     def __init__(self, folder: str | os.PathLike[str]) -> None:
         _, board = require("tensorboard", "tensorboard", "torch.utils.tensorboard")
         make_folder(path := file_name(folder, "folder"))
+        self.folder = path
         self._writer = board.SummaryWriter(str(path))
+
+    def __repr__(self) -> str:
+        return one_line("TensorBoard", {"folder": self.folder})
 
     def __call__(self, step: int, figures: Mapping[str, float]) -> None:
         for name, value in figures.items():

@@ -12,7 +12,7 @@ from typing import Any
 from ast_sim.dataset.reader import Dataset
 from ast_sim.models.registry import find_preset
 from ast_sim.runs.config_toml import read_changes
-from ast_sim.runs.folder import RunFolder
+from ast_sim.runs.run_file import open_run
 from ast_sim.runs.train_config import RunConfig, TrainConfig
 from ast_sim.support.argument_checks import file_name, require_type, several
 from ast_sim.support.errors import ConfigError, DatasetError
@@ -48,7 +48,7 @@ def configure(
     elif model is not None or preset is not None:
         raise ConfigError("a run that starts from another one has its model and settings: leave model and preset out")
     else:
-        source = RunFolder(from_run).settings
+        source = open_run(from_run).settings
         settings = dataclasses.replace(source, train=dataclasses.replace(source.train, minutes=None), data=str(data))
     before = settings
     with _naming(file):

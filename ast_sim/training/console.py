@@ -68,7 +68,6 @@ class Console(Progress):
         super().__init__(total, "steps", progress)
         self.signals = signals
         self.began = False
-        self._text = ""
 
     def begin(self, done: int) -> Console:
         """The steps begin; `done` steps were made before."""
@@ -78,11 +77,20 @@ class Console(Progress):
 
     def show(self, text: str) -> None:
         """How the steps go: replace the text behind the bar, or show a line."""
-        self._text = text
         if self._bar is not None:
             self._bar.set_postfix_str(text)
         elif self.shown:
             self.print(text)
+        self._report(text)
+
+    def _report(self, text: str) -> None:
+        """Give the caller's function a line that tells how the steps go."""
+        if self._call is not None and self.began:
+            self._call(self.done, self.total, text)
+
+    def _line(self, text: str, level: int = logging.INFO) -> None:
+        super().line(text, level)
+        self._report(text)
 
     def print(self, text: str) -> None:
         """Show a line that stays, on the standard output."""
@@ -93,14 +101,14 @@ class Console(Progress):
         sys.stdout.flush()
 
     def _advance(self) -> None:
-        super().advance(self._text)
+        super().advance(f"step {self.done + 1:,}")
 
     def _tell_count(self) -> None:
         """The lines of `show` tell it."""
 
     advance = _heard(_advance)
     show = _heard(show)
-    line = _heard(Progress.line)
+    line = _heard(_line)
     __exit__ = _heard(Progress.__exit__)
 
 

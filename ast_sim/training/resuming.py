@@ -10,6 +10,7 @@ from ast_sim.batches.training_pool import TrainingPool
 from ast_sim.dataset.reader import Dataset
 from ast_sim.runs import checkpoint
 from ast_sim.runs.folder import RunFolder
+from ast_sim.runs.run_file import first_weights
 from ast_sim.support.errors import TrainingError
 from ast_sim.training.optimizer import Optimizer
 from ast_sim.training.parallel.processes import Processes
@@ -63,7 +64,7 @@ class Saver:
 
     def start(self) -> bool:
         """Load the weights of the run that this one starts from; returns whether there is such a run."""
-        weights = self.run.first_weights()
+        weights = first_weights(self.run)
         if weights is None:
             return False
         self.model.load_state_dict(weights)

@@ -19,6 +19,7 @@ import torch
 
 from ast_sim.batches.torch_settings import usual_settings
 from ast_sim.dataset.reader import Dataset
+from ast_sim.inference.promises.known_weights import require_known_weights
 from ast_sim.inference.trained_run import Run
 from ast_sim.models.registry import build_model
 from ast_sim.models.simulator import Simulator
@@ -26,6 +27,7 @@ from ast_sim.ops.library import keep_memory
 from ast_sim.runs import checkpoint
 from ast_sim.runs.config_toml import has_config, write_config
 from ast_sim.runs.folder import RunFolder
+from ast_sim.runs.run_file import open_run
 from ast_sim.runs.train_config import RunConfig
 from ast_sim.support.argument_checks import file_name, require_bool, require_function
 from ast_sim.support.errors import RESUME, AstSimError, CheckpointError, ConfigError, TrainingError
@@ -51,7 +53,7 @@ def train(
     model: str | None = None,
     preset: str | None = None,
     config: str | os.PathLike[str] | None = None,
-    from_run: str | os.PathLike[str] | None = None,
+    from_run: str | os.PathLike[str] | Run | None = None,
     state: Sequence[str] = (),
     model_settings: Mapping[str, Any] | None = None,
     resume: bool = False,
@@ -68,16 +70,17 @@ def train(
         preset: the settings to start from; by default "tiny".
         config: a TOML file with settings, such as `config.toml` of a run. It may leave settings out. It does not
             name the dataset. Other arguments win over it.
-        from_run: a run. The new run starts with the weights and scales of its best checkpoint, and with its settings.
-            The settings of the model stay. If `steps` or `minutes` differs, warm-up, decay, validations and checkpoints
-            are chosen again.
+        from_run: a run: its folder, a file that `Run.save` wrote, or a `Run`. The new run starts with the weights and
+            scales of its best checkpoint, and with its settings. The settings of the model stay. If `steps` or
+            `minutes` differs, warm-up, decay, validations and checkpoints are chosen again.
         state: fields of the dataset that are predicted beside motion and stress, such as ("PEEQ", "reaction").
         model_settings: changes of the model's settings, such as {"hidden": 32}.
         resume: continue after the newest checkpoint, if there is one.
         callback: called with (step, {name: float}) when the losses are logged and after validations, such as
             `TensorBoard(folder)`. What it raises ends the training, after a checkpoint of the step.
         progress: True: a bar on a terminal, lines elsewhere; False: nothing is written, but the lines go to
-            `logging.getLogger("ast_sim")`, as always; or a function that is called with (step, steps, text).
+            `logging.getLogger("ast_sim")`, as always; or a function that is called with (step, steps, text) after each
+            step, and with the same step for each line: the losses, a validation, a stop.
         settings: changes of the training's settings (fields of `TrainConfig`), such as minutes=10, mirror=("x", "y").
 
     Raises:
@@ -92,6 +95,9 @@ def train(
         require_function("callback", callback, 0, {}, what="a function of (step, figures)")
     changes = changes_of(state, model_settings, settings)
     folder = file_name(out, "out")
+    if isinstance(from_run, Run):
+        require_known_weights(from_run, "start from")
+        from_run = from_run.path
     source = None if from_run is None else file_name(from_run, "from_run")
     chosen = configure(path_of(data), preset, (), model, config=config, from_run=source, changes=changes)
     start_training(folder, chosen, resume=resume, from_run=source, callback=callback, progress=progress)
@@ -183,7 +189,7 @@ def start_training(
         wanted = config or saved
         if wanted is None:
             raise TrainingError(f"{run} holds no run to resume: name the dataset to start one")
-        source = None if from_run is None else RunFolder(from_run)
+        source = None if from_run is None else open_run(from_run)
         with Dataset(wanted.data) as dataset:
             scales = measure(dataset)
             fit = partial(resolve, dataset=dataset, scales=scales, keep_model=source is not None)

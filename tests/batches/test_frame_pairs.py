@@ -10,7 +10,7 @@ from torch import nn
 from torch.utils.data import DataLoader
 
 from ast_sim import Dataset, NodeType, new_model
-from ast_sim.support.errors import DatasetError
+from ast_sim.support.errors import ConfigError, DatasetError
 
 
 @pytest.fixture(scope="module")
@@ -154,3 +154,32 @@ def test_processes_of_a_loader_give_the_same_batches(data, start):
                 assert one.keys() == other.keys() and all(torch.equal(one[name], other[name]) for name in one)
             else:
                 assert one[0].names == other[0].names and torch.equal(one[0].graph.elements, other[0].graph.elements)
+
+
+def test_what_is_no_pair_is_refused_by_name(data, tmp_path):
+    model, items = new_model(data, "mgn"), data.torch("train")
+    pairs = model.pairs(data)
+    for wrong, told in (("plates.h5", "'plates.h5'"), (None, "None"), (data["train"], "of the type Split")):
+        with pytest.raises(ConfigError, match=f"dataset is {told}; it must be an open ast_sim.Dataset"):
+            model.pairs(wrong)
+    for made, one, kind in ((items, items[0], "item of FramePairs"), (pairs, pairs[0], "pair of a batch and a target")):
+        for wrong, told in (
+            ([], f"items is empty; a batch needs one {kind} or more"),
+            (None, f"items is None; it must be a list of {kind}s"),
+            (one if isinstance(one, dict) else 5, f"; it must be a list of {kind}s"),
+            ([1], f"item 0 is 1; it must be one {kind}"),
+            ([one, None], f"item 1 is None; it must be one {kind}"),
+        ):
+            with pytest.raises(ConfigError, match=told):
+                made.collate(wrong)
+        for number in (10**6, -19):
+            with pytest.raises(IndexError, match=f"there is no item {number}: there are 18"):
+                made[number]
+        assert "pairs: 18, split: train, file: toy.h5)" in repr(made)
+    without = {name: values for name, values in items[0].items() if name != "stress"}
+    for other in (without, {"a": torch.zeros(1)}, {**items[0], "elements": torch.zeros(2, 10)}):
+        with pytest.raises(ConfigError, match="item 1 is no item of FramePairs, or of another dataset than item 0"):
+            items.collate([items[0], other])
+    with pytest.raises(ConfigError, match="item 0 is of the type tuple; it must be one pair of a batch and a target"):
+        pairs.collate([pairs[0][::-1]])
+    assert torch.equal(items[-1]["position"], items[17]["position"])

@@ -1,8 +1,14 @@
 """The pages of the reference are what the sources say."""
 
+import builtins
+import re
 from pathlib import Path
 
 import pytest
+
+import ast_sim
+from ast_sim import AstSimError
+from ast_sim.support import errors
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -28,6 +34,22 @@ def test_every_command_and_every_public_name_has_a_place(reference):
         assert f"## `ast-sim {name}`" in commands
     assert "train.peak_rate=" in commands and "(AST_SIM" not in commands
     assert "## `ast_sim.Dataset`" in api and "### `Scene.surface()`" in api and "NodeType.HANDLE = 3" in api
+
+
+def test_every_error_that_is_named_can_be_caught(reference):
+    api = reference.api()
+    named = {name for entry in re.findall(r"^- `([A-Z][\w, ]*)`:", api, re.MULTILINE) for name in entry.split(", ")}
+    assert {"RolloutError", "MissingExtra"} < named
+    kinds = {name for name, one in vars(errors).items() if isinstance(one, type) and issubclass(one, AstSimError)}
+    for name in (named | kinds) - set(dir(builtins)):
+        assert f"## `ast_sim.{name}`" in api and getattr(ast_sim, name) is getattr(errors, name)
+
+
+def test_what_public_methods_return_has_a_section(reference):
+    results = ["AnsweredFrame", "BodyForce", "Figures", "Generated", "NamedField", "PhysicsCheck", "SceneMesh", "Sweep"]
+    api = reference.api()
+    assert all(f"## `ast_sim.{name}`" in api for name in results)
+    assert "BodyForce(frame: int, time: float | None, body: int, force: np.ndarray, torque: np.ndarray)" in api
 
 
 def press(

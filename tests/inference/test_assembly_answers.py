@@ -2,6 +2,7 @@
 
 import csv
 import warnings
+from functools import partial
 
 import numpy as np
 import pytest
@@ -194,6 +195,23 @@ def test_wrong_questions(trained, tmp_path):
         (lambda: run.predict(scene, spec=spec), "leave scene, motion and stress out"),
         (lambda: run.predict(), "give a scene, or a specification"),
         (lambda: run.sweep(spec, {"travel": 2}, table=[{"travel": 1}]), "a table has the values of all parameters"),
+        *(
+            (partial(call, parameters=values), f"parameters is {told}; it must be values by name, such as")
+            for call in (partial(run.predict, spec=spec), partial(run.sweep, spec), partial(run.sweep, spec, table=[1]))
+            for values, told in (
+                (["travel"], "of the type list"),
+                ("travel=1", "'travel=1'"),
+                (("travel", 1), "of the type tuple"),
+                ({"travel"}, "of the type set"),
+                ([], "of the type list"),
+                ("", "''"),
+                (0, "0"),
+            )
+        ),
+        *(
+            (partial(run.sweep, spec, table=table), f"row {row} of table is {told}; it must be values by name")
+            for table, row, told in (([1], 0, "1"), (({"travel": 1}, "travel=1"), 1, "'travel=1'"), ([None], 0, "None"))
+        ),
         (lambda: run.predict(spec=spec, num_frames=0), "num_frames is 0; it must be at least 2"),
         (lambda: run.predict(spec=spec, num_frames=1), "num_frames is 1; it must be at least 2"),
         (lambda: run.predict(spec=spec, num_frames=3.0), "num_frames is 3.0; it must be a whole number"),

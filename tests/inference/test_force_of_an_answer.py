@@ -2,12 +2,15 @@
 
 from dataclasses import replace
 
+import h5py
 import numpy as np
 import pytest
 
 import ast_sim
 from ast_sim.inference.quantities.band import compared
 from ast_sim.named_field import REACTION
+
+EXACT = ast_sim.Effort.exact()
 
 
 @pytest.fixture(scope="module")
@@ -33,6 +36,22 @@ def test_the_network_alone_predicts_it_and_an_exact_answer_has_the_right_one(pla
     assert finished.errors(truth)["reaction"] < 0.01
     by_law = replace(finished, fields={}).reaction()
     assert np.array_equal(finished.reaction(), by_law) and not np.allclose(by_law, predicted, rtol=0.1)
+
+
+@pytest.mark.parametrize("effort", [ast_sim.Effort(newton_steps=1), ast_sim.Effort(newton_steps=3), EXACT])
+def test_an_answer_holds_one_force(plate, effort, tmp_path):
+    """After Newton steps the predicted reactions would belong to other positions: no answer and no file has them."""
+    run, truth = plate
+    answer = run.predict(truth, effort=effort)
+    assert answer.fields == {} and answer.frame(2).fields == {} and len(answer.last_steps) == 2
+    assert answer.errors(answer.trajectory) == {"displacement": 0, "reaction": 0, "stress": 0}
+    answer.save(tmp_path / "a.h5")
+    with ast_sim.Dataset(tmp_path / "a.h5") as data:
+        assert data["test"][0].fields == {}
+    answer.save(tmp_path / "a.vtkhdf")
+    with h5py.File(tmp_path / "a.vtkhdf") as file:
+        assert "von_mises" in file["VTKHDF/PointData"] and "reaction" not in file["VTKHDF/PointData"]
+    assert np.linalg.norm(answer.body_forces()[-1].force) == pytest.approx(np.linalg.norm(answer.reaction()[-1]))
 
 
 def test_the_true_reactions_of_a_file_are_the_force_of_the_true_positions(plate):

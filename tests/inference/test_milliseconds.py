@@ -133,13 +133,40 @@ def test_an_answer_is_compared_with_the_frame_of_the_same_number(truth):
     assert answer.errors(last)["displacement"] == answer.errors(whole)["displacement"] > 0
     cube = ast_sim.box((0, 0, 0), (1, 1, 1), (1, 1, 1))
     for wrong, text in (
-        (replace(last, frames=(0, 1)), "there is no frame 2; there are the frames 0 to 1"),
+        (replace(last, frames=(0, 5)), "the answer has 1 to 2, the truth has the frames 0, 5"),
+        (whole.select([1, 2]), "there is no frame 0; there are the frames 1 to 2"),
         (replace(last, length_unit="mm"), "is in m, but the truth is in mm"),
-        (replace(whole, position=way[[0, 1, 1]]), "prescribed nodes and the ones of the truth are up to"),
+        (replace(whole, position=way[[0, 1, 1]]), "the ones of the truth are up to 0.0164 apart in frame 2:"),
+        (replace(whole, position=way[[0, 0, 2]]), "the ones of the truth are up to 0.0164 apart in frame 1:"),
         (Trajectory(cube, np.zeros((3, 8, 3), np.float32)), "but the truth has 8 and 6"),
     ):
         with pytest.raises(AstSimError, match=text):
             answer.errors(wrong)
     still = run.predict(truth.scene, way[[0, 0]], effort=Effort())
-    with pytest.raises(ConfigError, match="in frame 1 of the truth nothing is displaced"):
-        still.errors(replace(whole, position=way[[0, 0]]))
+    for by in (0, 1e-9):
+        moved = way[[0, 0]] + np.array([[[0.0]], [[by]]], np.float32)
+        with pytest.raises(ConfigError, match=r"nothing is displaced in the truth, but for rounding, .* \(1\)"):
+            still.errors(replace(whole, position=moved))
+
+
+def test_errors_are_of_the_deepest_frame_that_both_have(truth):
+    """The plate is pressed, then let go: the last frame would say nothing."""
+    run = ast_sim.example_run("plates")
+    start, pressed = truth.position
+    way = np.stack([start, (start + pressed) / 2, pressed, start])
+    field = truth.fields["reaction"]
+    stored = replace(field, values=field.values[[0, 0, 1, 0]] * np.float32([1, 1, 1, 0])[:, None, None])
+    stress = truth.stress[[0, 1, 1, 0]] * np.float32([1, 0.5, 1, 0])[:, None, None]
+    whole = replace(truth, position=way, stress=stress, fields={"reaction": stored}, frames=None, times=None)
+    answer = run.predict(truth.scene, way, effort=Effort())
+    errors = answer.errors(whole)
+    assert set(errors) == {"displacement", "reaction", "stress"} and max(errors.values()) < 0.2
+    assert errors == pytest.approx(run.predict(truth.scene, way, frames=[2], effort=Effort()).errors(whole), rel=1e-4)
+    half = run.predict(truth.scene, way, frames=[3, 1], effort=Effort()).errors(whole)
+    assert half == pytest.approx(answer.errors(whole.select([0, 1, 3])), rel=1e-4)
+    assert set(half) == {"displacement", "stress"}  # the true force is 0 there
+    assert set(answer.errors(replace(whole, stress=0 * stress))) == {"displacement", "reaction"}
+    faint = replace(whole, stress=stress * np.float32([1, 1, 1e-9, 1e9])[:, None, None] + np.float32(1e-4))
+    assert set(answer.errors(faint)) == {"displacement", "reaction"}  # but for rounding
+    with pytest.raises(ConfigError, match="Predict a frame in which something is displaced, too"):
+        run.predict(truth.scene, way, frames=[3], effort=Effort()).errors(whole)

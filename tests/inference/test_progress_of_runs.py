@@ -43,8 +43,13 @@ def test_a_quiet_training_writes_nothing_but_the_log(trained, tmp_path, capfd, c
     lines = [record.message for record in caplog.records if record.name == "ast_sim"]
     assert sum(line.startswith("parameters  ") for line in lines) == 2
     assert sum(line.startswith("validation after step 6") for line in lines) == 2
-    assert [(done, total) for done, total, _ in told] == [(step, 6) for step in range(1, 7)]
-    assert told[-1][2].startswith("step 4/6: loss ")  # the losses that were logged last
+    assert {total for _, total, _ in told} == {6}
+    steps = [(done, text) for done, _, text in told if ": " not in text]
+    assert steps == [(step, f"step {step}") for step in range(1, 7)]
+    lines = [(done, text.split(": ")[0]) for done, _, text in told if ": " in text]
+    losses = [(step, f"step {step}/6") for step in (2, 4, 6)]
+    assert lines == [*losses, (6, "validation after step 6")] and told[1:3] == [told[1], (2, 6, told[2][2])]
+    assert told[2][2].startswith("step 2/6: loss ")
 
 
 def test_scenes_that_are_predicted_together_count_frames(trained, capfd):

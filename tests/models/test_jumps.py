@@ -121,9 +121,23 @@ def test_only_the_wanted_frames_are_computed(monkeypatch):
     for same in (slice(-2, None), np.array([5, 6]), range(5, 7)):
         assert Question.of(truth, "scene", same).frames == (5, 6)
     assert Question.of(truth, "scene", -1).frames == (6,)
-    for wrong in ([1.5], "last", [True], [[1, 2]], slice(1, None, 2.5), slice(None, None, 0)):
-        with pytest.raises(ConfigError, match="frames must be whole numbers, one such number, or a slice, not"):
+    for wrong, told in (
+        ([1.5], "; one is 1.5"),
+        ([1, "2"], "; one is '2'"),
+        ([True], "; one is True"),
+        ([np.bool_(True)], "; one is "),
+        ([[1, 2]], "; one is of the type list"),
+        ([1, [2, [3]]], "; one is of the type list"),
+        (np.array([1, 2.5]), "; one is "),
+        ("last", ", not 'last'"),
+        (2.5, ", not 2.5"),
+        (True, ", not True"),
+        (slice(1, None, 2.5), ", not of the type slice"),
+        (slice(None, None, 0), ", not of the type slice"),
+    ):
+        with pytest.raises(ConfigError, match=f"frames must be whole numbers, one such number, or a slice{told}"):
             Question.of(truth, "scene", wrong)
+    assert Question.of(truth, "scene", [torch.tensor(5), np.array(6)]).frames == (5, 6)
     with pytest.raises(ConfigError, match="scene: frame 6 is named twice: name each frame once"):
         Question.of(truth, "scene", [6, -1])
     np.testing.assert_allclose(last.position[0], every.position[6], rtol=0, atol=2e-6)

@@ -18,6 +18,7 @@ from ast_sim.runs import checkpoint
 from ast_sim.runs.config_toml import read_changes, read_config, read_origin
 from ast_sim.runs.folder import RunFolder
 from ast_sim.runs.metrics import Metrics
+from ast_sim.runs.run_file import first_weights
 from ast_sim.support.errors import CheckpointError, ConfigError
 from ast_sim.training.configure import configure
 from ast_sim.training.rates import step_seed
@@ -253,3 +254,39 @@ def test_a_settings_file_that_is_a_pipe_is_refused_at_once(tmp_path):
     for path in (tmp_path / "pipe", tmp_path):
         with pytest.raises(ConfigError, match="it is no regular file"):
             read_changes(path)
+
+
+def test_a_run_may_start_from_a_saved_file_or_an_open_run(folder, tmp_path):
+    source, path, data = ast_sim.Run(folder / "source"), tmp_path / "source.ast", folder / "toy.h5"
+    source.save(path)
+    losses = []
+    for number, start in enumerate((folder / "source", path, str(path), source, ast_sim.Run(path))):
+        run = ast_sim.train(data, tmp_path / f"run{number}", from_run=start, steps=1, progress=False)
+        assert run.settings.model == source.settings.model and run.settings.train.seed == source.settings.train.seed
+        losses.append(next(iter(Metrics(run.path)))["loss"])
+    assert len(set(losses)) == 1  # the weights of the same checkpoint
+    with pytest.raises(ConfigError, match=f"was started from .*source, not from {path}"):
+        start_training(tmp_path / "run0", resume=True, from_run=path)
+    start_training(tmp_path / "run1", resume=True, from_run=path)  # it has ended
+    with torch.no_grad():
+        next(source.model.parameters()).add_(1)
+    with pytest.raises(ConfigError, match=r"have changed since it was opened: save it \(Run.save\), and start from"):
+        ast_sim.train(data, tmp_path / "run", from_run=source, steps=1)
+    source.save(path)
+    with pytest.raises(CheckpointError, match="source.ast is not the checkpoint that .*run1 starts from"):
+        first_weights(RunFolder(tmp_path / "run1"))
+
+
+@pytest.mark.parametrize("name", ["nope.ast", "nope"])
+def test_a_run_that_is_not_there_is_named_so(folder, tmp_path, name):
+    missing = tmp_path / name
+    for call in (
+        lambda: ast_sim.Run(missing),
+        lambda: ast_sim.train(folder / "toy.h5", tmp_path / "out", from_run=missing, steps=1),
+    ):
+        with pytest.raises(CheckpointError, match=f"{name}: there is no such file or folder"):
+            call()
+    with pytest.raises(ConfigError, match="from_run is 5; it must be"):
+        ast_sim.train(folder / "toy.h5", tmp_path / "out", from_run=5, steps=1)
+    with pytest.raises(CheckpointError, match="is not a run folder"):
+        ast_sim.Run(tmp_path)

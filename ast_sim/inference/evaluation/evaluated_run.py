@@ -19,13 +19,15 @@ from ast_sim.inference.predicting.question import Question
 from ast_sim.support.argument_checks import file_name
 from ast_sim.support.disk import write_json
 from ast_sim.support.errors import ConfigError
-from ast_sim.support.notebook_table import html_table, one_line
+from ast_sim.support.notebook_table import html_bars, html_table, one_line
 from ast_sim.view import report
 from ast_sim.view.files import make_folder
 from ast_sim.view.page import page_name
 
 if TYPE_CHECKING:
     from ast_sim.inference.trained_run import Run
+
+MOST_BARS = 100  # of a drawing: the worst scenes
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +59,9 @@ class Evaluation:
         return one_line("Evaluation", self._headline())
 
     def _repr_html_(self) -> str:
-        return html_table("Evaluation", self._headline(), f"<pre>{escape(str(self))}</pre>")
+        errors = sorted(error for scene in self.figures.scenes if (error := scene.error("displacement")) is not None)
+        bars = html_bars(errors[-MOST_BARS:], "displacement error by scene") if errors else ""
+        return html_table("Evaluation", self._headline(), f"{bars}<pre>{escape(str(self))}</pre>")
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write all figures as JSON."""

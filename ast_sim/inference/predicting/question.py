@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,7 +16,7 @@ from ast_sim.mechanics.driven import Driven
 from ast_sim.mechanics.physics_check import Law
 from ast_sim.models.data_facts import DataFacts
 from ast_sim.models.model_config import ModelConfig
-from ast_sim.named_field import STRESS, NamedField
+from ast_sim.named_field import REACTION, STRESS, NamedField
 from ast_sim.scene import Scene, Trajectory
 from ast_sim.support.argument_checks import in_short
 from ast_sim.support.errors import ConfigError, RolloutError, counted
@@ -119,6 +121,8 @@ class Question:
             if numbers
         }
         stress = fields.pop(STRESS, None)
+        if last_steps:  # the positions have changed since the network predicted reactions
+            fields.pop(REACTION, None)
         return Answer(
             self.name,
             self.scene,
@@ -151,21 +155,29 @@ def fields_of(trajectory: Trajectory) -> dict[str, np.ndarray]:
 
 def _whole_numbers(frames: WantedFrames, count: int) -> list[int]:
     """The frames, of `count`, as a list; one number is a frame, too."""
-    wrong = f"frames must be whole numbers, one such number, or a slice, not {in_short(frames)}"
+    must = "frames must be whole numbers, one such number, or a slice"
+    wrong = f"{must}, not {in_short(frames)}"
     if isinstance(frames, slice):
         try:
             return list(range(count)[frames])
         except (TypeError, ValueError) as error:  # bounds that are no whole numbers, or a step of 0
             raise ConfigError(wrong) from error
-    if isinstance(frames, Mapping) or np.ma.is_masked(frames):
+    if isinstance(frames, Mapping | str | bytes) or np.ma.is_masked(frames):
         raise ConfigError(wrong)
+    listed: list[Any]
     try:
-        listed = np.asarray(list(frames) if isinstance(frames, Iterable) else [frames])
+        listed = list(frames) if isinstance(frames, Iterable) else [frames]
     except TypeError:  # an array of no axis counts as Iterable
-        listed = np.asarray([frames])
-    if listed.size and (listed.ndim != 1 or listed.dtype.kind not in "iu"):
-        raise ConfigError(wrong)
-    return listed.tolist()
+        listed = [frames]
+    numbers = []
+    for one in listed:
+        try:
+            numbers.append(operator.index(one))
+            if np.asarray(one).dtype == bool:  # it counts as a whole number
+                raise TypeError(one)
+        except TypeError as error:
+            raise ConfigError(wrong if one is frames else f"{must}; one is {in_short(one)}") from error
+    return numbers
 
 
 def not_finite(

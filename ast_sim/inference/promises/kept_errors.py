@@ -33,7 +33,7 @@ class KeptErrors:
     Attributes:
         efforts: K efforts, from the cheapest to the dearest; none for a model that predicts step by step.
         errors: by quantity ("displacement", "reaction", "stress"), K rows of n scenes; infinite where a prediction
-            failed. A quantity that some scene lacks is left out.
+            failed, or where the true quantity is 0. A quantity that no scene has is left out.
     """
 
     efforts: tuple[Effort, ...] = ()

@@ -53,10 +53,10 @@ def forget_other_weights(run: Run, by_content: bool = False) -> None:
         warn(f"the weights of {run.path} have changed since it was opened: no errors and no bands are known with these")
 
 
-def require_known_weights(run: Run) -> None:
-    """Raise ConfigError if the weights have changed: a calibration would be kept beside the ones that were trained."""
+def require_known_weights(run: Run, verb: str) -> None:
+    """Raise ConfigError if the weights have changed, since the files of the run hold the ones that were trained; `verb`
+    says what is to be done with a run that has the new ones."""
     if not run.weights.are_of(run.model, by_content=True):
         raise ConfigError(
-            f"the weights of {run.path} have changed since it was opened: save it (Run.save), and calibrate what is"
-            " saved"
+            f"the weights of {run.path} have changed since it was opened: save it (Run.save), and {verb} what is saved"
         )

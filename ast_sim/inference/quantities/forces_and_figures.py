@@ -131,13 +131,11 @@ def figures_of(answer: Answer, origin: Sequence[float]) -> list[dict[str, float]
 
 def _newton(answer: Answer, driven: Driven) -> np.ndarray:
     """[S, N, 3] in newton: the shares of the nodes in the force on the prescribed nodes `driven`."""
-    if REACTION in answer.fields and not answer.last_steps:  # the positions are the network's own
-        return _predicted(answer, driven)
+    if REACTION in answer.fields:  # after Newton steps there are none
+        return np.where(driven.nodes[:, None], answer.fields[REACTION].values, 0).astype(np.float64)
     try:
         law = _elastic_law(answer)
     except (ConfigError, SimulationError) as error:
-        if REACTION in answer.fields:
-            return _predicted(answer, driven)
         raise ConfigError(f"{answer.name} has no reaction: {error}") from error
     from ast_sim.mechanics.reaction import Reaction
 
@@ -156,11 +154,6 @@ def _newton(answer: Answer, driven: Driven) -> np.ndarray:
             ' ipctk is not installed, which finds all that touches: pip install "ast_sim[simulate]"'
         )
     return LENGTH_UNITS[answer.info.length_unit] ** 2 * np.array(shares).reshape(-1, answer.scene.num_nodes, 3)
-
-
-def _predicted(answer: Answer, driven: Driven) -> np.ndarray:
-    """[S, N, 3] in newton: the nodal reactions that the model predicts at the prescribed nodes `driven`."""
-    return np.where(driven.nodes[:, None], answer.fields[REACTION].values, 0).astype(np.float64)
 
 
 def _elastic_law(answer: Answer) -> NeoHookean:

@@ -1,17 +1,18 @@
-"""Relative errors of one frame: of the displacement, the force, the stress."""
+"""Relative errors of an answer: of the displacement, the force, the stress."""
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import math
-from collections.abc import Container
+from collections.abc import Container, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ast_sim.named_field import REACTION
+from ast_sim.number_arrays import ranges
 from ast_sim.scene import Trajectory
+from ast_sim.simulate.jobs.fastest_solver import deepest_frame
 from ast_sim.support.argument_checks import require_type
 from ast_sim.support.errors import ConfigError
 from ast_sim.view.fields import require_same_scene
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from ast_sim.models.model_config import ModelConfig
 
 QUANTITIES = ("displacement", "reaction", "stress")  # as `errors_of` names them
+ROUNDING = float(np.finfo(np.float32).eps)  # share of a number that single precision does not keep
 SAME = 1e-4  # of the size of a scene: positions that are no farther apart differ by rounding
 
 
@@ -36,8 +38,8 @@ def displacement(truth: Trajectory, frame: int) -> float:
 
 
 def moves(truth: Trajectory) -> bool:
-    """Whether a free node is displaced in any frame."""
-    return bool((truth.position[1:, ~truth.scene.prescribed] != truth.position[0, ~truth.scene.prescribed]).any())
+    """Whether free nodes are displaced in any frame, by more than single precision rounds."""
+    return displacement(truth, deepest_frame(truth)) > ROUNDING * np.abs(truth.position).max()
 
 
 def rms(difference: np.ndarray, rows: np.ndarray) -> float:
@@ -64,22 +66,57 @@ def stress_errors(
 def errors_of(answer: Answer, truth: Trajectory) -> dict[str, float]:
     """See `Answer.errors`."""
     require_type("truth", truth, Trajectory, "a Trajectory")
-    if not answer.frames:
-        raise ConfigError(f"{answer.name}: the answer has no frame to compare")
-    row = len(answer.frames) - 1
-    number = answer.frames[row]
-    truth = truth.select([0, number])  # by their numbers: frames between may be missing
-    frame = truth.num_frames - 1
-    _require_same_question(answer, row, truth)
+    number = _deepest_of_both(answer, truth)
+    row, frame = answer.frames.index(number), truth.numbers.index(number)
     errors = {"displacement": relative_error(answer.position[row], truth, frame)}
-    last = {name: dataclasses.replace(one, values=one.values[[row]]) for name, one in answer.fields.items()}
-    ours = dataclasses.replace(answer, position=answer.position[[row]], frames=(number,), fields=last)
-    true = dataclasses.replace(truth_in_place(answer, truth, [frame]), frames=(number,))
-    with contextlib.suppress(ConfigError):  # a figure that this scene has not
-        errors["reaction"] = relative_distance(ours.reaction(), true.reaction())
-    stress = None if answer.stress is None else answer.stress[row]
-    _, largest = stress_errors(truth, stress, frame, answer.stress_location or "node")
-    return errors if largest is None else {**errors, "stress": largest}
+    try:
+        ours = _only(answer, row).reaction()[0]
+        forces = truth_in_place(answer, truth, list(range(truth.num_frames))).reaction()
+    except ConfigError:  # a figure that this scene has not
+        pass
+    else:
+        if not _rounds_to_zero(np.linalg.norm(forces, axis=1), frame):
+            errors["reaction"] = relative_distance(ours, forces[frame])
+    if answer.stress is not None and truth.stress is not None:
+        rows = truth.scene.deforming(location := answer.stress_location or "node")
+        _, largest = stress_errors(truth, answer.stress[row], frame, location)
+        if largest is not None and not _rounds_to_zero(truth.stress[:, rows].max(axis=(1, 2), initial=0.0), frame):
+            errors["stress"] = largest
+    return errors
+
+
+def _only(answer: Answer, row: int) -> Answer:
+    """The answer with this frame alone."""
+    fields = {name: one.select([row]) for name, one in answer.fields.items()}
+    return dataclasses.replace(answer, position=answer.position[[row]], frames=(answer.frames[row],), fields=fields)
+
+
+def _rounds_to_zero(sizes: np.ndarray, frame: int) -> bool:
+    """Whether the size in a frame, of the sizes in all frames [S], is 0 but for rounding to single precision."""
+    return bool(sizes[frame] <= ROUNDING * sizes.max())
+
+
+def _deepest_of_both(answer: Answer, truth: Trajectory) -> int:
+    """The number of the frame, of the predicted ones that both have, in which the truth is displaced most.
+
+    Raises:
+        AstSimError: they share no frame, or not the motion; or nothing is displaced in these frames.
+    """
+    predicted = sorted(number for number in answer.frames if number >= answer.given)
+    both = [number for number in predicted if number in truth.numbers]
+    if not both:
+        raise ConfigError(
+            f"{answer.name}: the answer and the truth share no predicted frame: the answer has"
+            f" {ranges(predicted) or 'none'}, the truth has the frames {ranges(truth.numbers)}"
+        )
+    require_same_motion(answer, truth, both)
+    known = truth.select([0, *both])  # by their numbers: frames between may be missing
+    if not moves(known):
+        raise ConfigError(
+            f"{answer.name}: nothing is displaced in the truth, but for rounding, in the frames that both have"
+            f" ({ranges(both)}): there is no share of 0. Predict a frame in which something is displaced, too"
+        )
+    return known.numbers[deepest_frame(known)]
 
 
 def judging_fields(config: ModelConfig) -> list[str]:
@@ -96,42 +133,25 @@ def truth_in_place(answer: Answer, truth: Trajectory, rows: list[int]) -> Answer
     return dataclasses.replace(answer, position=truth.position[rows], stress=stress, fields=fields, last_steps=())
 
 
-def _require_same_question(answer: Answer, row: int, truth: Trajectory) -> None:
-    """Raise AstSimError unless the last frame of `truth` and a row of the answer have the same scene, unit and
-    prescribed positions; ConfigError if nothing is displaced there."""
-    _require_same_frame(answer, row, truth)
-    free = ~truth.scene.prescribed
-    if not (truth.position[-1] - truth.position[0])[free].any():
-        raise ConfigError(
-            f"{answer.name}: in frame {truth.numbers[-1]} of the truth nothing is displaced: there is no share of 0"
-        )
-
-
-def _require_same_frame(answer: Answer, row: int, truth: Trajectory) -> None:
-    """Raise AstSimError unless the last frame of `truth` and a row of the answer have the same scene, unit and
-    prescribed positions."""
-    require_same_scene(truth, answer.trajectory)
-    number = truth.numbers[-1]
-    unit = None if answer.info is None else answer.info.length_unit
-    if unit is not None and truth.length_unit not in (None, unit):
-        raise ConfigError(f"{answer.name} is in {unit}, but the truth is in {truth.length_unit}")
-    there = truth.position[-1]
-    away = np.abs(answer.position[row] - there)[truth.scene.prescribed].max(initial=0.0)
-    if away > SAME * np.ptp(there, axis=0).max():
-        raise ConfigError(
-            f"{answer.name}: its prescribed nodes and the ones of the truth are up to {away:.3g} apart in frame"
-            f" {number}: compare with a simulation of the same motion"
-        )
-
-
-def require_same_motion(answer: Answer, truth: Trajectory | None) -> None:
-    """Raise AstSimError unless the last frame of the answer is of the same scene, unit and motion in the truth, if one
-    is known."""
+def require_same_motion(answer: Answer, truth: Trajectory | None, numbers: Sequence[int]) -> None:
+    """Raise AstSimError unless the truth, if one is known, has the scene and the unit of the answer, and in the frames
+    with these numbers its prescribed positions."""
     if truth is None:
         return
     require_type("truth", truth, Trajectory, "a Trajectory")
-    if answer.frames:
-        _require_same_frame(answer, len(answer.frames) - 1, truth.select([answer.frames[-1]]))
+    require_same_scene(truth, answer.trajectory)
+    unit = None if answer.info is None else answer.info.length_unit
+    if unit is not None and truth.length_unit not in (None, unit):
+        raise ConfigError(f"{answer.name} is in {unit}, but the truth is in {truth.length_unit}")
+    for number in numbers:
+        there = truth.select([number]).position[0]
+        ours = answer.position[answer.frames.index(number)]
+        away = np.abs(ours - there)[truth.scene.prescribed].max(initial=0.0)
+        if away > SAME * np.ptp(there, axis=0).max():
+            raise ConfigError(
+                f"{answer.name}: its prescribed nodes and the ones of the truth are up to {away:.3g} apart in frame"
+                f" {number}: compare with a simulation of the same motion"
+            )
 
 
 def require_quantity(quantity: str, more: Container[str] = ()) -> None:

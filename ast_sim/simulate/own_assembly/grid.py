@@ -62,6 +62,32 @@ def parse_setting(text: str) -> tuple[str, list[Any]]:
     return name, np.linspace(first, last, count).tolist()
 
 
+def require_values(name: str, values: Any) -> None:
+    """Raise ConfigError unless the argument `name` has values of parameters by their names."""
+    require_type(name, values, Mapping, "values by name, such as {'travel': 4.2}")
+
+
+def rows_of(
+    parameters: Mapping[str, Any] | None, table: str | os.PathLike[str] | Sequence[Mapping[str, Any]] | None
+) -> Sequence[Mapping[str, Any]]:
+    """The rows that the arguments of `Run.sweep` ask for.
+
+    Raises:
+        ConfigError: both are given, one is of another kind, or it is as in `grid` and `read_table`.
+    """
+    if parameters is not None:
+        require_values("parameters", parameters)
+    if table is None:
+        return grid(parameters or {})
+    if parameters:
+        raise ConfigError("a table has the values of all parameters: leave the others out, or leave the table out")
+    if isinstance(table, str) or not isinstance(table, Sequence):
+        return read_table(table)
+    for number, row in enumerate(table):
+        require_values(f"row {number} of table", row)
+    return table
+
+
 def grid(values: Mapping[str, Any]) -> list[dict[str, Any]]:
     """One row for each combination of the values; a number or a text stands for itself, a mapping for several
     parameters as in `completed`.
@@ -69,7 +95,6 @@ def grid(values: Mapping[str, Any]) -> list[dict[str, Any]]:
     Raises:
         ConfigError: a parameter has no value or is given twice, or there are too many rows.
     """
-    require_type("parameters", values, Mapping, "values by name, such as {'travel': [1, 2]}")
     flat: dict[str, Sequence[Any]] = {}
     for name, value in flattened(values):
         if name in flat:
