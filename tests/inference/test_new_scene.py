@@ -245,7 +245,7 @@ def test_an_answer_reads_back_as_the_frames_that_it_has(run, tmp_path):
     with Dataset(tmp_path / "answer.h5") as data:
         found = data["test"][0]
     assert found.numbers == (2, 4) and np.array_equal(found.position, answer.position[::-1])
-    with pytest.raises(ConfigError, match="has the frames 2, 4 of a motion: a prediction needs all frames from 0 on"):
+    with pytest.raises(ConfigError, match="2, 4 of a motion: a model needs all frames from 0 on; predict its scene"):
         run.predict(found)
     answer.save(tmp_path / "answer.vtkhdf", truth)
     times, meshes = read(tmp_path / "answer.vtkhdf")

@@ -13,6 +13,7 @@ import torch
 from ast_sim.batches.batch_builder import State
 from ast_sim.dataset.reader import Dataset
 from ast_sim.dataset.solver_seconds import read_seconds
+from ast_sim.dataset.whole_motions import require_whole_motions
 from ast_sim.figures import Figures, SceneError, SceneFigures
 from ast_sim.inference.answer import Answer
 from ast_sim.inference.answering import answers as predictions
@@ -61,13 +62,12 @@ def evaluate(
 
     Raises:
         DatasetError: the split has no frame to predict.
-        ConfigError: `made_from` is given, but the solver is not run, or the dataset was made of other things.
+        ConfigError: `made_from` is given, but the solver is not run, or the dataset was made of other things; or a
+            scene has some frames of its motion only.
     """
     if made_from is not None:
         _require_origin(dataset, solver_scenes, made_from)
-    indices = dataset.with_frames(split, model.config.data.given_frames + 1)
-    if not indices:
-        raise DatasetError(f"{dataset.path}: the split {split} has no frame to predict")
+    indices = _predictable(dataset, split, model.config.data.given_frames + 1)
     outputs = model.config.data.outputs
     scheme = model.config.scheme
     constants = _training_means(dataset, outputs)
@@ -100,6 +100,16 @@ def evaluate(
         threads=torch.get_num_threads(),
         field_units={key: unit for key, _, _, unit in model.config.data.fields},
     )
+
+
+def _predictable(dataset: Dataset, split: str, least: int) -> list[int]:
+    """The trajectories of a split with at least `least` frames, after a check that there are some, with all frames of
+    their motions."""
+    require_whole_motions(dataset, split)
+    indices = dataset.with_frames(split, least)
+    if not indices:
+        raise DatasetError(f"{dataset.path}: the split {split} has no frame to predict")
+    return indices
 
 
 def _require_origin(dataset: Dataset, solver_scenes: int, made_from: str | os.PathLike[str]) -> None:
