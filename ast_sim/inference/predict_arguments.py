@@ -53,6 +53,7 @@ def new_question(
             )
         _require_whole(scene, config, scope, name)
         fields = fields_of(scene)
+        times = scene.times
         motion = Motion(scene.position)
         scene = scene.scene
     else:
@@ -62,11 +63,13 @@ def new_question(
         motion = _completed(config, scope, scene, motion, num_frames, name)
         stress = _given_stress(config, scene, stress, name)
         fields = {} if stress is None else {STRESS: stress}
+        times = None
     scene.require_predictable(name)  # before anything is told of such a scene
     _require_material(config, scope, scene, name)
     _require_resolved(scene, name)
     notes = (*notes, *_loose(scene), *_at_rest(scene), *scope.notes(scene, motion, config.scheme.needs_each_frame))
-    return Question(name, scene, motion.position, fields, movable=True, notes=notes).asking(frames)
+    question = Question(name, scene, motion.position, fields, movable=True, notes=notes, times=times)
+    return question.asking(frames)
 
 
 def scenes_of(scenes: Any, names: Any) -> list[tuple[Scene, Motions, str]]:

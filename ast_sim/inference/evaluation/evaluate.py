@@ -36,7 +36,7 @@ from ast_sim.named_field import STRESS, Output, require_fields
 from ast_sim.number_arrays import measured_time, percent
 from ast_sim.scene import Trajectory
 from ast_sim.simulate.jobs.recipe import recipe_of
-from ast_sim.support.errors import ConfigError, DatasetError, counted
+from ast_sim.support.errors import ConfigError, DatasetError, counted, warn
 
 ONE_STEP_NODES = 8192  # at most, of frames that are predicted together, unless a single one has more
 MEAN_TRAJECTORIES = 100  # training trajectories, at most, of whose stress `stress_constant` is the mean
@@ -53,8 +53,9 @@ def evaluate(
 ) -> Figures:
     """Predict all trajectories of a split and compare.
 
-    A scene without a frame to predict is left out. `advance` is called with the name of each scene, once for all of
-    its frames and once for its deepest frame, and of each scene that the solver has solved.
+    A scene without a frame to predict is left out. A warning tells of predictions that failed. `advance` is called with
+    the name of each scene, once for all of its frames and once for its deepest frame, and of each scene that the solver
+    has solved.
 
     Args:
         solver_scenes: in how many scenes the solver goes to the deepest frame, to compare.
@@ -90,7 +91,7 @@ def evaluate(
     return Figures(
         scenes=tuple(scenes),
         errors=tuple(row for quantity, of_scenes in errors.items() for row in errors_over_scenes(quantity, of_scenes)),
-        failures=sum(scene.failure is not None for scene in scenes),
+        failures=_told_failures(scenes),
         jumps=scheme.jumps,
         effort=dataclasses.asdict(effort),
         deepest=deepest_frames.deepest_frames(model, dataset, split, effort, solver_scenes, advance, made_from),
@@ -110,6 +111,14 @@ def _predictable(dataset: Dataset, split: str, least: int) -> list[int]:
     if not indices:
         raise DatasetError(f"{dataset.path}: the split {split} has no frame to predict")
     return indices
+
+
+def _told_failures(scenes: Sequence[SceneFigures]) -> int:
+    """How many predictions failed; a warning tells of them."""
+    failures = [scene.failure for scene in scenes if scene.failure is not None]
+    if failures:
+        warn(f"{len(failures)} of {counted(len(scenes), 'prediction')} failed; the first: {failures[0]}")
+    return len(failures)
 
 
 def _require_origin(dataset: Dataset, solver_scenes: int, made_from: str | os.PathLike[str]) -> None:
