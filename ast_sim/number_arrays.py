@@ -192,6 +192,15 @@ def require_numbering(name: str, count: int, frames: Sequence[int] | None, times
         raise DatasetError(f"{name}: frames starts at {frames[0]}; the first frame of a motion is 0")
 
 
+def require_whole_motion(name: str, numbers: Sequence[int], advice: str) -> None:
+    """Raise ConfigError unless these are the numbers of all frames of a motion, 0, 1, 2 and so on; it ends with the
+    advice."""
+    if tuple(numbers) != tuple(range(len(numbers))):
+        raise ConfigError(
+            f"{name} has the frames {ranges(numbers)} of a motion: a model needs all frames from 0 on; {advice}"
+        )
+
+
 def ranges(numbers: Iterable[int]) -> str:
     """Ascending whole numbers as text: "0 to 5, 8, 10 to 12"."""
     runs: list[list[int]] = []

@@ -7,6 +7,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+import torch
 import toy
 from meshes import two_tetrahedra
 
@@ -61,6 +62,31 @@ def test_a_dataset_and_a_split(tmp_path):
             assert "a&lt;b.h5" in shown and "a<b.h5" not in shown
             assert [cell.text for cell in ElementTree.fromstring(shown).iter("th")][0] in ("file", "name")
     assert repr(data).startswith("Dataset(")  # a closed one, too
+
+
+def test_an_evaluation_in_which_a_scene_failed(tmp_path, monkeypatch):
+    small = {"model": "mgn", "model_settings": {"hidden": 16, "blocks": 1}, "steps": 1}
+    run = ast_sim.train(toy.write(tmp_path / "a.h5", (2, 0, 2)), tmp_path / "run", **small, progress=False)
+    whole = run.evaluate(solver_scenes=0, progress=False)
+    error = whole.figures.error("displacement").rmse_sequence
+    assert f"scenes: 2, displacement error: {error:.4g} m, stress error: " in repr(whole)
+    advance = run.model.advance
+    broken = ["test/000001"]
+
+    def some_fail(batch, prescribed):
+        position, prediction = advance(batch, prescribed)
+        fails = any(name.startswith(one) for name in batch.names for one in broken)
+        return (torch.full_like(position, torch.nan) if fails else position), prediction
+
+    monkeypatch.setattr(run.model, "advance", some_fail)
+    for failed, first in ((1, "test/000001"), (2, "test/000000")):
+        with pytest.warns(UserWarning, match=f"{failed} of 2 predictions failed; the first: {first}: the predicted"):
+            found = run.evaluate(solver_scenes=0, progress=False)
+        assert found.figures.failures == failed
+        shown = "Evaluation(run: run, data: a.h5, scenes: 2, displacement error: failed, stress error: failed)"
+        assert repr(found) == shown and ">failed</td>" in found._repr_html_()
+        assert f"scenes: 2, failed: {failed}" in str(found)
+        broken.append("test/000000")
 
 
 def test_a_scene_is_drawn_from_far_to_near():

@@ -13,6 +13,7 @@ from torch.utils.data import Dataset as TorchDataset
 
 from ast_sim.dataset.layout import GIVEN_FRAMES
 from ast_sim.dataset.reader import Dataset
+from ast_sim.dataset.whole_motions import require_whole_motions
 from ast_sim.ops import join_indices
 from ast_sim.support.argument_checks import require_type, several
 from ast_sim.support.errors import ConfigError, DatasetError
@@ -68,11 +69,13 @@ class FramePairs(TorchDataset[dict[str, Tensor]]):
     - `trajectory` and `frame` [1]: the number of the trajectory in the split, and of the frame to predict.
 
     Raises:
+        ConfigError: a trajectory has some frames of its motion only.
         DatasetError: no trajectory of the split has a frame to predict; or, from an item, a sample cannot be read.
     """
 
     def __init__(self, dataset: Dataset, split: str) -> None:
         require_type("dataset", dataset, Dataset, "an open ast_sim.Dataset")
+        require_whole_motions(dataset, split)
         self._dataset = dataset
         self._split = split
         self._given = GIVEN_FRAMES[dataset.info.integration]

@@ -19,6 +19,7 @@ from ast_sim.batches.mirror_and_shift import Placement
 from ast_sim.batches.scheme import Scheme
 from ast_sim.batches.torch_settings import tensors_on_cpu
 from ast_sim.dataset.reader import Dataset
+from ast_sim.dataset.whole_motions import require_whole_motions
 from ast_sim.named_field import STRESS, require_fields
 from ast_sim.scene import Scene
 from ast_sim.support.argument_checks import in_short
@@ -123,6 +124,7 @@ class PairSampler:
     come from the first k scenes of the split.
 
     Raises:
+        ConfigError: a trajectory has some frames of its motion only.
         DatasetError: the split has no pair, or a sample cannot be read.
     """
 
@@ -151,6 +153,7 @@ class PairSampler:
         self.first_frame = scheme.given_frames - 1  # the least t of a pair
         self._mirrored = np.array([axis in mirror for axis in "xyz"])
         self._shift = np.float32(shift)
+        require_whole_motions(dataset, split)
         chosen = range(dataset.count(split))[:scenes]
         frames = np.array([dataset.num_frames(split, i) for i in chosen], np.int64)
         self._starts = np.concatenate([[0], np.cumsum(np.maximum(frames - 1 - self.first_frame, 0))])

@@ -104,15 +104,20 @@ class GuardedFile:
 
     def attributes(self, group: h5py.Group | h5py.Dataset) -> dict[str, AttributeValue]:
         """The attributes of a group or of an array."""
-        values = {}
         with self.reading(f"an attribute of {_path(group) or 'the file'}") as name:
-            for key in group.attrs:
-                size = h5py.h5a.get_info(group.id, key.encode("utf-8", "surrogateescape")).data_size
-                value: Any = group.attrs[key] if size <= self.size else None
-                if value is None or np.ndim(value) > 1:
-                    raise DatasetError(f"{name}, {key}, is larger than the file, or no list")
-                values[key] = plain_value(value)
-        return values
+            return {key: self._attribute(name, group, key) for key in group.attrs}
+
+    def attribute(self, group: h5py.Group, key: str) -> AttributeValue | None:
+        """One attribute of a group, much sooner than all of them; None if it has none of this name."""
+        with self.reading(f"an attribute of {_path(group)}") as name:
+            return self._attribute(name, group, key) if key in group.attrs else None
+
+    def _attribute(self, name: str, group: h5py.Group | h5py.Dataset, key: str) -> AttributeValue:
+        size = h5py.h5a.get_info(group.id, key.encode("utf-8", "surrogateescape")).data_size
+        value: Any = group.attrs[key] if size <= self.size else None
+        if value is None or np.ndim(value) > 1:
+            raise DatasetError(f"{name}, {key}, is larger than the file, or no list")
+        return plain_value(value)
 
     def verify(self, group: h5py.Group) -> None:
         """Compare the hash of a trajectory with the hashes of its arrays and with its attributes, at its first use."""

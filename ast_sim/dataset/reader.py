@@ -140,11 +140,7 @@ class Dataset:
 
     @property
     def material(self) -> Material:
-        """The names of the material columns that every scene has.
-
-        Raises:
-            DatasetError: the file names another number of columns.
-        """
+        """The names of the material columns that every scene has; a DatasetError: the file names too many or few."""
         try:
             return self.info.material(self.material_width)
         except DatasetError as error:
@@ -177,6 +173,12 @@ class Dataset:
     def num_frames(self, split: str, index: int) -> int:
         """The number of frames of a trajectory."""
         return len(self._framed(split, index)["position"])
+
+    def numbers(self, split: str, index: int) -> tuple[int, ...]:
+        """The numbers of the frames of a trajectory in its motion. As of `num_frames`, hashes are compared later."""
+        stored = self._file.attribute(self._unverified(split, index), NUMBERING[0])
+        with self._file.reading(f"the attribute frames of {split}/{index:06d}"):
+            return tuple(map(int, stored if isinstance(stored, list) else range(self.num_frames(split, index))))
 
     def frames(self, split: str, index: int, start: int, stop: int) -> tuple[np.ndarray, np.ndarray | None]:
         """Frames start to stop - 1: position [stop - start, N, 3] and stress [stop - start, N or E, 1] or None."""
@@ -225,13 +227,11 @@ class Dataset:
         return digest.hexdigest()
 
     def with_frames(self, split: str, least: int) -> list[int]:
-        """The trajectories of a split with at least `least` frames. Where a solver gave up in the first, only the start
-        is there."""
+        """The trajectories of a split with at least `least` frames. Where a solver gave up at once, one is left."""
         return [index for index in range(self.count(split)) if self.num_frames(split, index) >= least]
 
     def spread(self, split: str, most: int, fields: Collection[str] = ()) -> Iterator[tuple[str, Trajectory]]:
-        """At most `most` trajectories of a split that move, as `load` reads them, evenly spread over it, and names
-        for messages."""
+        """At most `most` trajectories of a split that move, as `load` reads them, evenly spread, with their names."""
         moving = self.with_frames(split, 2)
         for place in np.unique(np.linspace(0, len(moving) - 1, min(len(moving), most)).astype(int)):
             yield self._name(split, moving[place]), self.load(split, moving[place], fields)

@@ -22,6 +22,7 @@ from ast_sim.inference.quantities.forces_and_figures import (
     write_figures,
     write_forces,
 )
+from ast_sim.inference.quantities.frames_of_answers import require_frames, time_of
 from ast_sim.inference.quantities.relative_errors import errors_of, require_quantity, require_same_motion
 from ast_sim.mechanics.driven import Driven
 from ast_sim.mechanics.linearised.linearised_contact import STILL
@@ -58,13 +59,12 @@ class Answer:
         source: the origin of the answer: attributes that `trajectory` gets.
         stress_location: where the rows of the stress are: "node" or "element".
         frames: the numbers of the S frames in the motion of the question.
-        seconds: the wall seconds from the call to the answer, with all that is prepared for the mesh. Several
-            scenes that are predicted together share their time equally.
+        seconds: the wall seconds from call to answer, also for the mesh; scenes predicted together share them.
         notes: what is unusual about the scene for the run, as sentences; they are warnings as well.
         latents: what the network made of each computed frame, [D] by number (`familiarity`).
         p_value: how usual the scene is beside the calibration scenes, up to 1; a note tells one of 0.05 or less.
         expected_error: the mean relative error of the displacement of validation scenes, at their deepest frame, with
-            the same effort. It is no bound for this scene. None: the run did not measure it, or there are notes.
+            the same effort, and no bound for this scene. None: it was not measured, there are notes, or it failed.
         last_steps: of each computed frame, in ascending order, the size of its last Newton step (`NewtonSteps.size`);
             a next step would be about its square. 0 after the solver; empty without Newton steps.
         driven: the prescribed nodes that move farthest together in the whole motion.
@@ -73,6 +73,7 @@ class Answer:
             or what was given. Newton steps leave "reaction" out, since forces then follow from positions (`reaction`,
             `body_forces`); they do not change the others.
         bands: of each quantity, as `band` takes them.
+        times: the seconds of frames by number, where the question has times; else they follow from `info`.
     """
 
     name: str
@@ -96,6 +97,7 @@ class Answer:
     fields: dict[str, NamedField] = field(default_factory=dict)
     latents: dict[int, np.ndarray] = field(default_factory=dict)
     p_value: float | None = None
+    times: Mapping[int, float] = field(default_factory=dict)
 
     @property
     def how_far(self) -> list[str]:
@@ -153,10 +155,9 @@ class Answer:
         return self._frame(self.frames.index(number))
 
     def _frame(self, row: int) -> AnsweredFrame:
-        times = None if self.info is None else self.info.times((self.frames[row],))
         return AnsweredFrame(
             self.frames[row],
-            None if times is None else times[0],
+            time_of(self, self.frames[row]),
             self.position[row],
             self.position[row] - self.scene.rest_position,
             None if self.stress is None else self.stress[row, :, 0],
@@ -180,9 +181,8 @@ class Answer:
             RolloutError: the answer has no such frame.
             MissingExtra: matplotlib is not installed.
         """
+        require_frames(self, "draw")
         shown = self.trajectory
-        if not self.frames:
-            raise RolloutError(f"{self.name}: the answer has no frame to draw", self)
         row = picture.farthest(shown) if number is None else shown.numbers.index(self.frame(number).number)
         return picture.plot(shown, row, self.name, shown.length_unit or "m")
 
@@ -207,8 +207,7 @@ class Answer:
 
     @property
     def trajectory(self) -> Trajectory:
-        """The answer as a trajectory, in ascending order of the frames; its attributes hold the origin, the given
-        frames and the seconds."""
+        """The answer as a trajectory, in ascending order of the frames. Attributes: origin, given frames, seconds."""
         order = np.argsort(self.frames, kind="stable")
         frames = tuple(self.frames[row] for row in order)
         attributes = {
@@ -225,7 +224,7 @@ class Answer:
             attributes,
             stress_location=None if self.stress is None else self.stress_location,
             frames=frames,
-            times=None if self.info is None else self.info.times(frames),
+            times=tuple(time for number in frames if (time := time_of(self, number)) is not None) or None,
             length_unit=None if self.info is None else self.info.length_unit,
             fields={name: one.select(order.tolist()) for name, one in self.fields.items()},
         )
@@ -285,8 +284,9 @@ class Answer:
 
         Raises:
             ConfigError: as in `reaction`.
-            AstSimError: the suffix is another one, or the file cannot be written.
+            AstSimError: there is no frame, the suffix is another one, or the file cannot be written.
         """
+        require_frames(self, "save")
         write_forces(file_name(path, "path"), self.body_forces())
 
     def check(self) -> PhysicsCheck:
@@ -298,8 +298,7 @@ class Answer:
         """
         unit = "" if self.info is None else self.info.length_unit
         rows = np.flatnonzero(self.computed)
-        numbers = [self.frames[row] for row in rows]
-        return check_physics(self.scene, self.position[rows], numbers, self.law, unit)
+        return check_physics(self.scene, self.position[rows], [self.frames[row] for row in rows], self.law, unit)
 
     def figures(self, origin: Sequence[float] = (0.0, 0.0, 0.0)) -> list[dict[str, float]]:
         """What an engineer asks of each frame: the travel of the prescribed nodes, the reaction and its components (if
@@ -318,8 +317,9 @@ class Answer:
             truth: the true trajectory, if it is known; a file for ParaView then holds the errors, too.
 
         Raises:
-            AstSimError: the suffix or the motion of the truth is another one, or the file cannot be written.
+            AstSimError: there is no frame; suffix or motion of the truth is another one; the file cannot be written.
         """
+        require_frames(self, "save")
         path = file_name(path, "path")
         if path.suffix not in SUFFIXES:
             raise AstSimError(f"{path}: the name of a prediction must end in one of {', '.join(SUFFIXES)}")

@@ -12,7 +12,7 @@ from ast_sim.importers.scene_mesh import SceneMesh
 from ast_sim.inference.predicting.question import Question, WantedFrames, fields_of
 from ast_sim.models.model_config import ModelConfig
 from ast_sim.named_field import STRESS, require_fields
-from ast_sim.number_arrays import ranges, real_numbers, require_finite
+from ast_sim.number_arrays import real_numbers, require_finite, require_whole_motion
 from ast_sim.plausibility.topology import no_scene
 from ast_sim.prescribed_motion import Motion, RigidMotion, Vector, frames_for
 from ast_sim.runs.scope import Scope, spacing_of
@@ -53,6 +53,7 @@ def new_question(
             )
         _require_whole(scene, config, scope, name)
         fields = fields_of(scene)
+        times = scene.times
         motion = Motion(scene.position)
         scene = scene.scene
     else:
@@ -62,11 +63,13 @@ def new_question(
         motion = _completed(config, scope, scene, motion, num_frames, name)
         stress = _given_stress(config, scene, stress, name)
         fields = {} if stress is None else {STRESS: stress}
+        times = None
     scene.require_predictable(name)  # before anything is told of such a scene
     _require_material(config, scope, scene, name)
     _require_resolved(scene, name)
     notes = (*notes, *_loose(scene), *_at_rest(scene), *scope.notes(scene, motion, config.scheme.needs_each_frame))
-    return Question(name, scene, motion.position, fields, movable=True, notes=notes).asking(frames)
+    question = Question(name, scene, motion.position, fields, movable=True, notes=notes, times=times)
+    return question.asking(frames)
 
 
 def scenes_of(scenes: Any, names: Any) -> list[tuple[Scene, Motions, str]]:
@@ -124,11 +127,7 @@ def _require_whole(trajectory: Trajectory, config: ModelConfig, scope: Scope, na
     """Raise ConfigError or DatasetError unless a trajectory has all frames of its motion, in the unit of the run, and a
     stress where the model predicts one, if any."""
     trajectory.check(name)
-    if trajectory.numbers != tuple(range(trajectory.num_frames)):
-        raise ConfigError(
-            f"{name} has the frames {ranges(trajectory.numbers)} of a motion: a prediction needs all frames from 0 on;"
-            " predict its scene with a motion"
-        )
+    require_whole_motion(name, trajectory.numbers, "predict its scene with a motion")
     if trajectory.length_unit not in (None, scope.length_unit):
         raise ConfigError(
             f"{name} has lengths in {trajectory.length_unit}, but the run was trained in {scope.length_unit}: read it"

@@ -17,6 +17,7 @@ import torch
 
 from ast_sim.dataset.reader import Dataset
 from ast_sim.dataset.solver_seconds import read_seconds
+from ast_sim.dataset.whole_motions import require_whole_motions
 from ast_sim.inference.answering import answers
 from ast_sim.inference.calibrate import require_new_scenes, require_runs
 from ast_sim.inference.effort import Effort, choices, options_of
@@ -116,8 +117,8 @@ def trade(
         progress: as in `generate`.
 
     Raises:
-        ConfigError: the split has trained or chosen the run, or none of its scenes moves; the solver's seconds are not
-            above 0; or a run beside has learned from another dataset or has the name of another run.
+        ConfigError: the split has trained or chosen the run, none of its scenes moves, or one has some frames only;
+            the solver's seconds are not above 0; a run beside has learned from another dataset, or has another's name.
         DatasetError: the dataset cannot be read.
     """
     (scenes,) = required_whole(1, scenes=scenes)
@@ -131,6 +132,7 @@ def trade(
     try:
         with run.open(data) as dataset:
             require_new_scenes(run, dataset, split)
+            require_whole_motions(dataset, split)
             if made_from is not None:
                 recipe_of(str(dataset.path), dataset.info, made_from)  # a wrong one would leave the solver out
             moving = (index for index in range(dataset.count(split)) if moves(dataset.load(split, index)))

@@ -277,17 +277,17 @@ class Run:
         for question, answer, known in zip(questions, answers, facts, strict=True):
             p_value, unlike = (None, ()) if self.calibration is None else self.calibration.compared(answer)
             notes = (*question.notes, *unlike)
-            expected = None if notes else self.expected_error(effort)
+            in_doubt = notes or answer.failure is not None
+            expected = None if in_doubt else self.expected_error(effort)
             origin = {"predicted_by": str(self.path), "step": self.step, **answer.source, **known}
             origin["source"] = answer.name
-            if notes:
+            if in_doubt:
                 origin.pop("promise", None)
             if expected is not None:
                 origin["expected_error"] = expected
             bands = {} if self.calibration is None else self.calibration.bands(answer, effort, notes)
             shared = {"info": self.info, "expected_error": expected, "seconds": seconds, "bands": bands}
-            answer = dataclasses.replace(answer, source=origin, notes=notes, p_value=p_value, **shared)
-            told.append(answer)
+            told.append(answer := dataclasses.replace(answer, source=origin, notes=notes, p_value=p_value, **shared))
             if answer.failure is not None and throw:
                 raise RolloutError(answer.failure, answer)
             for doubt in (*unlike, *doubts(answer)):

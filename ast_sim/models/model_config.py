@@ -73,8 +73,11 @@ class ModelConfig:
                 require_range(f"model.{item.name}", getattr(self, item.name), *limits)
 
     def check_inputs(self, key: str, known: tuple[str, ...]) -> None:
-        """Raise ConfigError if a name in the setting `key` is not one of `known`."""
-        for name in getattr(self, key) or ():
+        """Raise ConfigError if a name in the setting `key` is not one of `known`, or stands there twice."""
+        names = getattr(self, key) or ()
+        if len(set(names)) < len(names):
+            raise ConfigError(f"model.{key} is {', '.join(names[:10])}; name each once")
+        for name in names:
             if name not in known:
                 raise ConfigError(f"model.{key}: {name!r} is unknown: choose of {', '.join(known)}")
 

@@ -18,6 +18,7 @@ from ast_sim.support.argument_checks import file_name, require_type, several
 from ast_sim.support.errors import ConfigError, DatasetError
 from ast_sim.support.toml_settings import NONE, NOTHING, assigned, change
 
+_LENGTHS = ("train.minutes", "train.steps", "train.epochs")
 _FOLLOW_FROM_STEPS = ("train.warmup", "train.decay", "train.validate_every", "train.checkpoint_every")
 
 
@@ -38,8 +39,9 @@ def configure(
     """
     file = None if config is None else file_name(config, "config")
     given = {} if file is None else read_changes(file)
-    if "train.steps" in given:  # a run that was given minutes has both
-        given.pop("train.minutes", None)
+    if "train.steps" in given:  # the settings of a run have all of them
+        for key in ("train.minutes", "train.epochs"):
+            given.pop(key, None)
     if from_run is None:
         with _naming(file):
             named = given.pop("model.name", "ast")
@@ -55,6 +57,7 @@ def configure(
         settings = _changed(settings, given, reschedule=from_run is not None)
     later = {**assigned(settings, assignments), **changes}
     settings = _changed(settings, later, reschedule=from_run is not None or "train.steps" in given)
+    _require_effect(later, settings)
     for key, old, new in differences(before, settings, "model") if from_run is not None else ():
         raise ConfigError(f"{key} is {new!r}, but {from_run} has {old!r}: a run that starts from it keeps its model")
     return settings
@@ -93,18 +96,34 @@ def changes_of(
 
 
 def _changed(config: RunConfig, values: Mapping[str, Any], reschedule: bool) -> RunConfig:
-    """Settings with new values. With `reschedule`, another number of steps leaves open what follows from it. Minutes
-    replace a number of steps, and steps replace minutes."""
-    steps, minutes = (key in values and values[key] not in (None, NONE) for key in ("train.steps", "train.minutes"))
-    if steps and minutes:
-        raise ConfigError("train.minutes and train.steps exclude each other: give one of them")
-    if minutes:
-        values = {**dict.fromkeys(("train.steps", *_FOLLOW_FROM_STEPS), NONE), **values}
-    elif steps:
+    """Settings with new values. With `reschedule`, another number of steps leaves open what follows from it. Minutes,
+    steps and epochs replace each other."""
+    lengths = [key for key in _LENGTHS if values.get(key) not in (None, NONE)]
+    if len(lengths) > 1:
+        raise ConfigError(f"{' and '.join(lengths)} exclude each other: give one of them")
+    if lengths == ["train.steps"]:
         values = {"train.minutes": NONE, **values}
+    elif lengths:
+        values = {**dict.fromkeys(("train.minutes", "train.steps", *_FOLLOW_FROM_STEPS), NONE), **values}
     if reschedule and values.get("train.steps", config.train.steps) != config.train.steps:
         values = {**dict.fromkeys(_FOLLOW_FROM_STEPS, NONE), **values}
     return change(config, values)
+
+
+def _require_effect(given: Mapping[str, Any], config: RunConfig) -> None:
+    """Raise ConfigError if a setting that was given, not a preset's, has no effect on the dataset."""
+    keys = [key for key in ("stress_weight", "validate_every", "validate_scenes") if given.get(f"train.{key}")]
+    if not keys:
+        return
+    with Dataset(config.data) as dataset:
+        of_stress = config.model.state or dataset.info.stress_location != "none"
+        unvalidated = None if dataset.count("valid") else f"{dataset.path} has no validation scenes"
+    useless = dict.fromkeys(keys, unvalidated)
+    useless["stress_weight"] = None if of_stress else "no stress and no field is predicted"
+    for key in keys:
+        if useless[key] is not None:
+            value = getattr(config.train, key)
+            raise ConfigError(f"train.{key} = {value} is of no use here: {useless[key]}; leave it out")
 
 
 @contextmanager

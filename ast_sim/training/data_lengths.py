@@ -10,6 +10,7 @@ import numpy as np
 
 from ast_sim.batches.frame_pairs import target_counts
 from ast_sim.dataset.reader import Dataset
+from ast_sim.dataset.whole_motions import require_whole_motions
 from ast_sim.inference.evaluation.measures import SquaredError, rmse_pooled
 from ast_sim.material import hints
 from ast_sim.models.data_facts import DataFacts
@@ -58,11 +59,13 @@ def measure(dataset: Dataset) -> DataScales:
 
     Raises:
         TrainingError: the split is empty.
+        ConfigError: a scene for training or validation has some frames of its motion only.
         DatasetError: in one of these scenes nothing can deform, or its material cannot be one.
     """
     count = dataset.count("train")
     if count == 0:
         raise TrainingError(f"{dataset.path} has no trajectories to train on: the split train is empty")
+    require_whole_motions(dataset, "train", "valid")
     displacement = []
     increment = []
     lengths = []

@@ -121,6 +121,7 @@ def test_numbers_and_times_of_frames_travel_with_a_trajectory(tmp_path):
     members = {"train": [whole, some, uneven, uneven.select([1, 4])]}
     with Dataset(write(tmp_path / "d.h5", members, time_step=0.5)) as dataset:
         found = list(dataset["train"])
+        assert [dataset.numbers("train", index) for index in range(4)] == [one.numbers for one in found]
     assert [one.numbers for one in found] == [(0, 1, 2, 3, 4), (2, 4), (0, 1, 2, 3, 4), (1, 4)]
     assert [one.times for one in found[1:]] == [(1.0, 2.0), (0.0, 0.1, 0.3, 0.4, 2.0), (0.1, 2.0)]
     assert found[0].times == (0.0, 0.5, 1.0, 1.5, 2.0) and found[0].length_unit == "m"

@@ -548,12 +548,51 @@ def test_a_pool_that_is_of_no_use_is_refused(data, tmp_path, setting, message):
         ),
         (["model.L_cell=4", "model.cell_spacings=2"], "model.cell_spacings is of no use with model.L_cell"),
         (["model.young=5"], "model.young is no setting but a fact of the data"),
+        (
+            ["model.residual=m2e", "model.element_inputs="],
+            "model.residual: m2e is of no use here: nothing is predicted on elements",
+        ),
+        (
+            ["model.residual=m2m,e2m", "model.element_inputs="],
+            "model.residual: e2m is of no use here: there are no model.element_inputs",
+        ),
+        (
+            ["model.residual=m2m,m2c", "model.element_inputs=displacement"],
+            "model.residual: m2m is of no use here: elements are nodes of the graph",
+        ),
+        (["model.residual=c2m"], "model.residual: c2m is of no use here: nodes and tokens attend to each other"),
+        (["model.node_inputs=displacement,displacement"], "model.node_inputs is displacement, displacement; name each"),
+        (["model.residual=m2c,m2c"], "model.residual is m2c, m2c; name each once"),
+        (["train.epochs=5", "train.steps=1"], "train.steps and train.epochs exclude each other: give one of them"),
+        (["train.epochs=5", "train.minutes=1"], "train.minutes and train.epochs exclude each other: give one of them"),
     ],
 )
 def test_settings_without_effect_are_refused(data, tmp_path, settings, message):
     with pytest.raises(ConfigError, match=message):
         start.start_training(tmp_path / "run", start.configure(data, "tiny", settings))
     assert not (tmp_path / "run").exists()
+
+
+def test_settings_without_effect_on_this_dataset_are_refused(data, tmp_path):
+    bare = toy.write(tmp_path / "bare.h5", (2, 0, 1), stress=False)
+    for changes, message in (
+        ({"stress_weight": 0.5}, "train.stress_weight = 0.5 is of no use here: no stress and no field is predicted"),
+        ({"validate_every": 3}, "train.validate_every = 3 is of no use here: .*bare.h5 has no validation scenes"),
+        ({"validate_scenes": 8}, "train.validate_scenes = 8 is of no use here: .*bare.h5 has no validation scenes"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            start.train(bare, tmp_path / "run", steps=1, **changes)
+        assert not (tmp_path / "run").exists()
+        assert start.configure(data, "tiny", [f"train.{key}={value}" for key, value in changes.items()])
+    assert start.configure(bare, "tiny", ["train.stress_weight=0", "train.validate_scenes=0"])
+    assert start.configure(bare, "tiny", ["model.state=PEEQ", "train.stress_weight=0.5"])
+
+
+def test_epochs_replace_the_steps_of_a_preset(data):
+    with_steps = start.configure(data, "original", model="mgn").train
+    assert with_steps.steps == 10_000_000
+    by_epochs = start.configure(data, "original", ["train.epochs=5"], model="mgn").train
+    assert (by_epochs.steps, by_epochs.epochs) == (None, 5)
 
 
 @pytest.mark.parametrize("jumps", [True, False])

@@ -13,6 +13,7 @@ import torch
 from ast_sim.batches.batch_builder import State
 from ast_sim.dataset.reader import Dataset
 from ast_sim.dataset.solver_seconds import read_seconds
+from ast_sim.dataset.whole_motions import require_whole_motions
 from ast_sim.figures import Figures, SceneError, SceneFigures
 from ast_sim.inference.answer import Answer
 from ast_sim.inference.answering import answers as predictions
@@ -35,7 +36,7 @@ from ast_sim.named_field import STRESS, Output, require_fields
 from ast_sim.number_arrays import measured_time, percent
 from ast_sim.scene import Trajectory
 from ast_sim.simulate.jobs.recipe import recipe_of
-from ast_sim.support.errors import ConfigError, DatasetError, counted
+from ast_sim.support.errors import ConfigError, DatasetError, counted, warn
 
 ONE_STEP_NODES = 8192  # at most, of frames that are predicted together, unless a single one has more
 MEAN_TRAJECTORIES = 100  # training trajectories, at most, of whose stress `stress_constant` is the mean
@@ -52,8 +53,9 @@ def evaluate(
 ) -> Figures:
     """Predict all trajectories of a split and compare.
 
-    A scene without a frame to predict is left out. `advance` is called with the name of each scene, once for all of
-    its frames and once for its deepest frame, and of each scene that the solver has solved.
+    A scene without a frame to predict is left out. A warning tells of predictions that failed. `advance` is called with
+    the name of each scene, once for all of its frames and once for its deepest frame, and of each scene that the solver
+    has solved.
 
     Args:
         solver_scenes: in how many scenes the solver goes to the deepest frame, to compare.
@@ -61,13 +63,12 @@ def evaluate(
 
     Raises:
         DatasetError: the split has no frame to predict.
-        ConfigError: `made_from` is given, but the solver is not run, or the dataset was made of other things.
+        ConfigError: `made_from` is given, but the solver is not run, or the dataset was made of other things; or a
+            scene has some frames of its motion only.
     """
     if made_from is not None:
         _require_origin(dataset, solver_scenes, made_from)
-    indices = dataset.with_frames(split, model.config.data.given_frames + 1)
-    if not indices:
-        raise DatasetError(f"{dataset.path}: the split {split} has no frame to predict")
+    indices = _predictable(dataset, split, model.config.data.given_frames + 1)
     outputs = model.config.data.outputs
     scheme = model.config.scheme
     constants = _training_means(dataset, outputs)
@@ -90,7 +91,7 @@ def evaluate(
     return Figures(
         scenes=tuple(scenes),
         errors=tuple(row for quantity, of_scenes in errors.items() for row in errors_over_scenes(quantity, of_scenes)),
-        failures=sum(scene.failure is not None for scene in scenes),
+        failures=_told_failures(scenes),
         jumps=scheme.jumps,
         effort=dataclasses.asdict(effort),
         deepest=deepest_frames.deepest_frames(model, dataset, split, effort, solver_scenes, advance, made_from),
@@ -100,6 +101,24 @@ def evaluate(
         threads=torch.get_num_threads(),
         field_units={key: unit for key, _, _, unit in model.config.data.fields},
     )
+
+
+def _predictable(dataset: Dataset, split: str, least: int) -> list[int]:
+    """The trajectories of a split with at least `least` frames, after a check that there are some, with all frames of
+    their motions."""
+    require_whole_motions(dataset, split)
+    indices = dataset.with_frames(split, least)
+    if not indices:
+        raise DatasetError(f"{dataset.path}: the split {split} has no frame to predict")
+    return indices
+
+
+def _told_failures(scenes: Sequence[SceneFigures]) -> int:
+    """How many predictions failed; a warning tells of them."""
+    failures = [scene.failure for scene in scenes if scene.failure is not None]
+    if failures:
+        warn(f"{len(failures)} of {counted(len(scenes), 'prediction')} failed; the first: {failures[0]}")
+    return len(failures)
 
 
 def _require_origin(dataset: Dataset, solver_scenes: int, made_from: str | os.PathLike[str]) -> None:

@@ -52,7 +52,9 @@ class Evaluation:
         for quantity in ("displacement", "stress"):
             error = self.figures.error(quantity)
             if error is not None:
-                facts[f"{quantity} error"] = f"{error.rmse_sequence:.4g} {self.figures.unit(quantity)}"
+                size = error.rmse_sequence
+                shown = "failed" if size is None else f"{size:.4g} {self.figures.unit(quantity)}"
+                facts[f"{quantity} error"] = shown
         return facts
 
     def __repr__(self) -> str:

@@ -40,6 +40,7 @@ class Question:
             the given ones too.
         movable: the scene may be moved into the domain of the model.
         notes: what is unusual about the scene for the model, as sentences.
+        times: of all frames of the motion in seconds; None: they are not known.
     """
 
     name: str
@@ -49,11 +50,12 @@ class Question:
     frames: tuple[int, ...] | None = None
     movable: bool = False
     notes: tuple[str, ...] = ()
+    times: tuple[float, ...] | None = None
 
     @classmethod
     def of(cls, truth: Trajectory, name: str, frames: WantedFrames | None = None) -> Question:
         """The question whose true answer is a known trajectory, which has all frames of its motion."""
-        return cls(name, truth.scene, truth.position, fields_of(truth)).asking(frames)
+        return cls(name, truth.scene, truth.position, fields_of(truth), times=truth.times).asking(frames)
 
     def asking(self, frames: WantedFrames | None) -> Question:
         """The same question for these frames only; negative numbers count from the end.
@@ -138,6 +140,7 @@ class Question:
             driven=Driven.of(self.scene, self.prescribed_position),
             law=law_of(config),
             source=dict(source),
+            times={} if self.times is None else {number: self.times[number] for number in numbers},
             latents={number: row for number in numbers if (row := latents.get(number)) is not None},
         )
 

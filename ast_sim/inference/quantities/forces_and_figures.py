@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ast_sim.dataset.layout import LENGTH_UNITS
+from ast_sim.inference.quantities.frames_of_answers import time_of
 from ast_sim.mechanics.driven import Driven
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean
 from ast_sim.named_field import REACTION
@@ -66,7 +67,7 @@ def forces_on_bodies(answer: Answer) -> list[BodyForce]:
         position = answer.position.astype(np.float64)
         arms = metres * (position - position[:, own].mean(axis=1, keepdims=True))
         torques = np.cross(arms, shares).sum(axis=1)
-        times = answer.info.times(answer.frames) or (None,) * len(answer.frames)
+        times = [time_of(answer, number) for number in answer.frames]
         forces = zip(answer.frames, times, shares.sum(axis=1), torques, strict=True)
         rows += [BodyForce(frame, time, body, force, torque) for frame, time, force, torque in forces]
     return sorted(rows, key=lambda row: (answer.frames.index(row.frame), row.body))

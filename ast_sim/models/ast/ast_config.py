@@ -105,7 +105,21 @@ class ASTConfig(ProximityConfig):
             raise ConfigError("model.element_inputs: stress needs a dataset with stress on elements")
         if resolved.data.output_columns("element") and not elements:
             raise ConfigError("model.element_inputs: what is predicted on elements needs some, such as displacement")
+        resolved._check_residual()
         return resolved
+
+    def _check_residual(self) -> None:
+        """Raise ConfigError if `residual`, where it is chosen, names a step that the network does not have."""
+        absent = {
+            "m2m" if self.element_inputs else "e2m": "elements are nodes of the graph"
+            if self.element_inputs
+            else "there are no model.element_inputs",
+            **({"c2m": "nodes and tokens attend to each other (model.exchanges)"} if self.exchanges else {}),
+            **({} if self.data.output_columns("element") else {"m2e": "nothing is predicted on elements"}),
+        }
+        for name in self.residual if self.residual != type(self).residual else ():
+            if name in absent:
+                raise ConfigError(f"model.residual: {name} is of no use here: {absent[name]}; leave it out")
 
     def facts(self, length_unit: str, mesh_spacing: float | None = None) -> dict[str, str]:
         """See `ModelConfig`."""

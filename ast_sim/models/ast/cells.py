@@ -56,7 +56,7 @@ class Cells:
 def doublings(config: ASTConfig, position: Tensor) -> int | None:
     """How often the domain must double around its centre to hold positions [N, 3]; None if L would pass 21."""
     center = torch.tensor(config.data.domain_center, dtype=torch.float64)
-    reach = float((position.double() - center).abs().max()) if len(position) else 0.0
+    reach = float((position.detach().double() - center).abs().max()) if len(position) else 0.0
     for growth in range(22 - config.level):
         if reach <= config.data.domain_half_width * 2.0**growth:
             return growth

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from ast_sim.dataset.reader import Dataset
+from ast_sim.dataset.whole_motions import require_whole_motions
 from ast_sim.scene import Trajectory
 from ast_sim.simulate.jobs.display import SceneProgress
 from ast_sim.simulate.jobs.pool import Process
@@ -196,7 +197,8 @@ def cheapest(outcomes: Iterable[Outcome], error: float) -> Outcome | None:
 
 
 def deepest_frame(trajectory: Trajectory) -> int:
-    """The number of the frame in which the free nodes are displaced most, in the mean square."""
+    """The row of the frame in which the free nodes are displaced most, in the mean square; its number, if the
+    trajectory has all frames of its motion."""
     moved = trajectory.position - trajectory.position[0]
     free = ~trajectory.scene.prescribed
     return int(np.square(moved[:, free], dtype=np.float64).sum(axis=(1, 2)).argmax())
@@ -230,13 +232,14 @@ def solver_outcomes(
 
     Raises:
         ConfigError: the dataset was not made by the bundled solver or from a family with inertia, or there is no such
-            frame.
+            frame, or a scene has some frames of its motion only.
         SimulationError: drawing the scene again gives another one, or a process ended before its time.
         DatasetError: the dataset cannot be read, or there is no such trajectory.
     """
     if not starts or min(starts) < 0 or repeats < 1:
         raise ConfigError(f"starts {list(starts)} must be at least 0, and repeats {repeats} at least 1")
     with Dataset(dataset) as data:
+        require_whole_motions(data, split)
         recipe = recipe_of(str(dataset), data.info, made_from)
         frames = [_frame(data, split, index, which, frame_of) for which, index in enumerate(indices)]
     request = {
