@@ -63,7 +63,7 @@ def _may_overlap(scene: Scene, rest: np.ndarray) -> bool:
     starts = np.flatnonzero(np.diff(scene.body[order], prepend=-1))
     low, high = (extreme.reduceat(rest[order], starts, axis=0) for extreme in (np.minimum, np.maximum))
     deforms = np.maximum.reduceat(scene.deforming_nodes[order], starts)
-    meet = ((low[:, None] <= high) & (low <= high[:, None])).all(axis=2)
+    meet: np.ndarray = np.all((low[:, None] <= high) & (low <= high[:, None]), axis=2)
     np.fill_diagonal(meet, False)
     return bool((meet & (deforms[:, None] | deforms)).any())
 
