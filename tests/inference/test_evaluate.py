@@ -193,7 +193,7 @@ def test_the_figures_are_json_and_a_readable_table(evaluated):
     assert pooled == found.error("displacement", horizon="one_step", nodes="all").rmse_pooled
     scene = written["scenes"][0]
     assert scene["errors"]["stress"]["model"]["rollout_all"]["deforming"] == found.scenes[0].error("stress")
-    after = {"corrections": 0, "newton_steps": 0, "solved": False, "precision": "float32"}
+    after = {"corrections": 0, "newton_steps": 0, "solved": False, "solved_beyond": 0.0, "precision": "float32"}
     assert (scene["name"], written["effort"]) == ("test/000000", after)
     lines = table(found).splitlines()
     hold = found.error("displacement", "hold_still")
