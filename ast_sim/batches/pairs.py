@@ -178,9 +178,8 @@ class PairSampler:
         return self.num_pairs
 
     def __repr__(self) -> str:
-        return one_line(
-            "PairSampler", {"pairs": f"{len(self):,}", "split": self._split, "file": self._dataset.path.name}
-        )
+        facts = {"pairs": f"{len(self):,}", "split": self._split, "file": self._dataset.path.name}
+        return one_line("PairSampler", facts)
 
     def __getitem__(self, number: int) -> tuple[Batch, Target]:
         """One pair of all, as a batch of its own. Its noise and its placement are new at each call; the seed of torch

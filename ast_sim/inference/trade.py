@@ -107,14 +107,12 @@ def trade(
 
     Args:
         data: a dataset, its path or open; by default the one that the run was trained on.
-        split: whose scenes are predicted.
+        split, scenes: whose scenes are predicted, and how many, at most: the first ones that move.
         beside: other runs that have learned from the same dataset, such as other models. Each stands in the tables with
             its fastest effort, by the name of its folder.
-        scenes: the number of scenes, at most: the first ones of the split that move.
         solver_seconds: what another program takes for such a scene, to the error of its mesh; our solver is not run.
         made_from: the specification or the parts of your own of which the dataset was made; the solver needs them.
-        command: what is recorded as the origin of the figures.
-        progress: as in `generate`.
+        command, progress: what is recorded as the origin of the figures; as in `generate`.
 
     Raises:
         ConfigError: the split has trained or chosen the run, none of its scenes moves, or one has some frames only;

@@ -29,7 +29,7 @@ from ast_sim.inference.sweep import Sweep, sweep
 from ast_sim.number_arrays import percent
 from ast_sim.runs import run_file
 from ast_sim.scene import Scene, Trajectory
-from ast_sim.simulate.own_assembly.grid import require_values, rows_of
+from ast_sim.simulate.own_assembly.grid import required_values, rows_of
 from ast_sim.support.argument_checks import file_name, require_bool, require_type, several
 from ast_sim.support.errors import ConfigError, RolloutError, warn
 from ast_sim.support.notebook_table import html_table, one_line
@@ -154,9 +154,8 @@ class Run:
             frames: numbers of the wanted frames, such as [-1], or a slice; by default all. A model that jumps computes
                 no other frame. With friction take [-2, -1]: if a body has two equilibria, the frame before decides.
             effort: what follows the first call of a model that jumps; by default `self.effort`.
-            error: instead, the relative error of the displacement at the deepest frame that 90 % of scenes keep, or by
-                quantity {"displacement": 0.05, "reaction": 0.1, "stress": 0.1} (`ast_sim.calibrate` first).
-            ms: instead, at most how long it takes, in milliseconds on this machine.
+            error, ms: instead, the relative error at the deepest frame that 90 % of scenes keep, of the displacement
+                or {"reaction": 0.1, "stress": 0.1} (`ast_sim.calibrate` first); or milliseconds on this machine.
             num_frames: S, only for rigid motions; by default the prescribed nodes move as far in one as in training.
             stress, name: [given, N or E, 1] in pascal, of the given frames, by default zero; a name for messages.
             throw, progress: raise an error if it fails, else the answer's `failure` says why; as in `generate`.
@@ -172,9 +171,8 @@ class Run:
         if spec is not None:
             if not (scene is None and motion is None and stress is None):
                 raise ConfigError("a specification gives the scene and the motion: leave scene, motion and stress out")
-            if parameters is not None:
-                require_values("parameters", parameters)
-            (built,) = ask(spec, [parameters or {}], self.scope, self.folder.specification, num_frames, nodes)
+            values = {} if parameters is None else required_values("parameters", parameters)
+            (built,) = ask(spec, [values], self.scope, self.folder.specification, num_frames, nodes)
             scene, motion, facts, notes = built.scene, built.motion, built.facts, built.notes
             num_frames = None
         elif parameters is not None or nodes is not None or scene is None:

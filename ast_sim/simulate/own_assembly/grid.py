@@ -62,9 +62,10 @@ def parse_setting(text: str) -> tuple[str, list[Any]]:
     return name, np.linspace(first, last, count).tolist()
 
 
-def require_values(name: str, values: Any) -> None:
-    """Raise ConfigError unless the argument `name` has values of parameters by their names."""
+def required_values(name: str, values: Any) -> Mapping[str, Any]:
+    """The argument `name`; ConfigError, if it is not values of parameters by their names."""
     require_type(name, values, Mapping, "values by name, such as {'travel': 4.2}")
+    return values
 
 
 def rows_of(
@@ -75,16 +76,15 @@ def rows_of(
     Raises:
         ConfigError: both are given, one is of another kind, or it is as in `grid` and `read_table`.
     """
-    if parameters is not None:
-        require_values("parameters", parameters)
+    values = {} if parameters is None else required_values("parameters", parameters)
     if table is None:
-        return grid(parameters or {})
-    if parameters:
+        return grid(values)
+    if values:
         raise ConfigError("a table has the values of all parameters: leave the others out, or leave the table out")
     if isinstance(table, str) or not isinstance(table, Sequence):
         return read_table(table)
     for number, row in enumerate(table):
-        require_values(f"row {number} of table", row)
+        required_values(f"row {number} of table", row)
     return table
 
 
