@@ -57,7 +57,7 @@ def repeated(truth: Trajectory, horizons: int) -> Trajectory:
     there, last = np.arange(1, truth.num_frames), truth.num_frames - 1
     order = np.concatenate([[0], *(there if i % 2 == 0 else last - there for i in range(horizons))])
     stress = None if truth.stress is None else truth.stress[order]
-    return replace(truth, position=truth.position[order], stress=stress, cauchy_stress=None)
+    return replace(truth, position=truth.position[order], stress=stress, cauchy_stress=None, frames=None, times=None)
 
 
 def phase_errors(truth: Trajectory, result: Answer) -> dict[str, SquaredError]:

@@ -1,12 +1,12 @@
 """The study of jumps, from end to end on scenes of 100 nodes."""
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
 
-from ast_sim.inference.effort import DIALS
+from ast_sim.inference.effort import DIALS, Effort
 from benchmarks.studies import jumps
 
 
@@ -40,10 +40,7 @@ def test_a_row_is_trained_measured_and_shown_and_found_again(small):
     assert row["by_calls"][0] == pytest.approx(np.mean(dial[0, 0]["relative_error"]), rel=1e-6)
     default = dial[row["effort"]["corrections"], row["effort"]["newton_steps"]]
     assert row["relative_error"] == pytest.approx(np.mean(default["relative_error"]), rel=1e-6)
-    assert (
-        walk["effort"] == {"corrections": 0, "newton_steps": 0, "solved": False, "precision": "float32"}
-        and walk["by_calls"] == walk["dial"] == []
-    )
+    assert walk["effort"] == asdict(Effort()) and walk["by_calls"] == walk["dial"] == []
     text = jumps.PAGE.read_text()
     assert f"{100 * row['relative_error']:.1f} ±" in text and "times as long" in text and "every frame" in text
     assert text.count("\n## ") == 2 and "Worst: test/" in text

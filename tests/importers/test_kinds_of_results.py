@@ -345,5 +345,6 @@ def test_a_stress_whose_components_change_from_frame_to_frame_is_refused(tmp_pat
     with pytest.raises(DatasetError, match=f"f_2.vtu: 's' {cause}"):
         read_series(tmp_path, FieldNames(stress="s", handle="0:zmin"))
     if (first is None) != (last is None):
-        with pytest.raises(DatasetError, match=r"f_2.vtu: the field 's' has [16] components, in the first frame [61]"):
+        told = r"f_2.vtu: the field 's' has (1 component|6 components), in the first frame [61]"
+        with pytest.raises(DatasetError, match=told):
             read_series(tmp_path, FieldNames(fields=("s",), handle="0:zmin"))

@@ -86,7 +86,7 @@ def test_friction_explains_forces_across_the_axes(tmp_path):
     assert imbalance.value < 0.01
     smooth = replace(law, material=Material(("young", "poisson"), {"friction": 0.0}))
     without = check_physics(scene, truth.position[1:], [1, 2], smooth, "mm")
-    assert without.residual.value > 5 * residual.value and without.residual.sentence.endswith("solver accepts")
+    assert without.residual.value > 5 * residual.value and "100,000" not in without.residual.sentence
 
 
 def test_barriers_of_parallel_edges_and_pairs_that_pull(tmp_path):

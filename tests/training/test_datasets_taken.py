@@ -13,7 +13,7 @@ def test_a_path_or_an_open_dataset(tmp_path, monkeypatch):
     path = toy.write(tmp_path / "toy.h5")
     started = []
     monkeypatch.setattr(start, "start_training", lambda run, config, **_: started.append((run, config)))
-    monkeypatch.setattr(start, "Run", lambda run: run)
+    monkeypatch.setattr(start, "Run", type("Run", (), {"__new__": lambda cls, run: run}))
     with Dataset(path) as data:
         for one in (path, str(path), data):
             assert train(one, tmp_path / "run", steps=2) == tmp_path / "run"

@@ -95,15 +95,16 @@ def test_a_scene_in_which_nothing_can_deform_is_one_line(trained, tmp_path, kind
     assert not (tmp_path / "new" / "config.toml").exists() and not (tmp_path / "answer.h5").exists()
 
 
-def test_coincident_nodes_of_an_element_are_trained_and_predicted_without_nan(trained, tmp_path):
+def test_coincident_nodes_of_an_element_are_refused(trained, tmp_path):
     model, run = trained
     first, second = toy.plate(0).scene.elements[0, :2]
     truth = plate(np.array([second]), place=first)
     data = write(tmp_path / "twin.h5", truth)
-    start.start_training(tmp_path / "new", start.configure(data, "tiny", SMALL + MORE[model], model))
-    for folder in (run, tmp_path / "new"):
-        answer = Run(folder).predict(truth)
-        assert answer.failure is None and np.isfinite(answer.position).all()
+    flat = r"element 0 with the nodes \[0, 8, 10, 11\] has no volume; 2 of 72 elements have none: repair the mesh"
+    with pytest.raises(DatasetError, match=flat):
+        start.start_training(tmp_path / "new", start.configure(data, "tiny", SMALL + MORE[model], model))
+    with pytest.raises(DatasetError, match=flat):
+        Run(run).predict(truth)
 
 
 @pytest.mark.parametrize(

@@ -153,7 +153,8 @@ def lines(frames: DeepestFrames) -> list[str]:
     if len(after) > 1:
         told.append(f"  after each call, and each Newton step: {', '.join(after)} %")
     if frames.not_converged:
-        told.append(f"  in {frames.not_converged} of {len(frames.scenes)} scenes the Newton steps have not converged")
+        of_all = counted(len(frames.scenes), "scene")
+        told.append(f"  in {frames.not_converged} of {of_all} the Newton steps have not converged")
     if frames.stress_share is not None and frames.largest_stress is not None:
         told.append(
             f"  stress: {frames.stress_share:.2f} of the error of the frame's true mean; the largest is"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import statistics
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import torch
@@ -79,18 +79,19 @@ def evaluate(
         name = f"{split}/{index:06d}"
         truth = _truth(dataset, split, index, model.config.data)
         (answer,) = predictions(model, [Question.of(truth, name)], effort)
-        one_step = one_step_predictions(model, truth, name) if scheme.errors_add_up else (None, {})
-        errors["displacement"].append(displacement_errors(truth, one_step[0], answer))
-        for key, location, *_ in outputs:
-            errors[key].append(field_errors(key, location, truth, one_step[1].get(key), answer, constants[key]))
-        own = [row for quantity, of_scenes in errors.items() for row in scene_errors(quantity, of_scenes[-1])]
+        of_scene = _errors_of_scene(model, truth, name, answer, constants)
+        for quantity, values in of_scene.items():
+            errors[quantity].append(values)
+        own = [row for quantity, values in of_scene.items() for row in scene_errors(quantity, values)]
         recorded = truth.attributes.get("solve_seconds")
         solver = seconds.get(name, recorded if isinstance(recorded, list) else None)
         scenes.append(_scene_figures(truth, answer, own, solver))
         advance(name)
     return Figures(
         scenes=tuple(scenes),
-        errors=tuple(row for quantity, of_scenes in errors.items() for row in errors_over_scenes(quantity, of_scenes)),
+        errors=tuple(
+            row for quantity, of_all in errors.items() if of_all for row in errors_over_scenes(quantity, of_all)
+        ),
         failures=_told_failures(scenes),
         jumps=scheme.jumps,
         effort=dataclasses.asdict(effort),
@@ -101,6 +102,19 @@ def evaluate(
         threads=torch.get_num_threads(),
         field_units={key: unit for key, _, _, unit in model.config.data.fields},
     )
+
+
+def _errors_of_scene(
+    model: Simulator, truth: Trajectory, name: str, answer: Answer, constants: Mapping[str, float]
+) -> dict[str, Errors]:
+    """The errors of the displacement and of each output that the answer has: Newton steps leave the reaction out."""
+    steps = model.config.scheme.errors_add_up
+    position, fields = one_step_predictions(model, truth, name) if steps else (None, {})
+    errors = {"displacement": displacement_errors(truth, position, answer)}
+    for key, location, *_ in model.config.data.outputs:
+        if key == STRESS or key in answer.fields:
+            errors[key] = field_errors(key, location, truth, fields.get(key), answer, constants[key])
+    return errors
 
 
 def _predictable(dataset: Dataset, split: str, least: int) -> list[int]:

@@ -237,7 +237,7 @@ def test_broken_mesh_files_are_refused(tmp_path, files):
     meshio.write(tmp_path / "plain.bdf", mesh, file_format="nastran")
     text = (tmp_path / "plain.bdf").read_text()
     (tmp_path / "system.bdf").write_text(text.replace("BEGIN BULK", "BEGIN BULK\nGRDSET,,5"))
-    assert "holds a GRDSET with a coordinate system of its own" in refusal(tmp_path / "system.bdf")
+    assert "line 4 stands in the coordinate system 5, which there is not" in refusal(tmp_path / "system.bdf")
     with pytest.raises(ConfigError, match="zones.tec is no STEP, STL or mesh file: files of the kind .tec are not"):
         (tmp_path / "zones.tec").write_text("")
         part_source(tmp_path / "zones.tec")
