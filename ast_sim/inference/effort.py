@@ -13,7 +13,7 @@ from statistics import fmean
 from typing import TYPE_CHECKING, Any, Self
 
 from ast_sim.support.argument_checks import require_bool, require_type
-from ast_sim.support.errors import ConfigError
+from ast_sim.support.errors import ConfigError, counted
 from ast_sim.support.precisions import Precision, require_precision
 from ast_sim.support.toml_settings import require_range, whole
 
@@ -94,7 +94,7 @@ class Effort:
     def text(self) -> str:
         """Such as "2 corrections, up to 1 Newton step, then the solver"."""
         parts = [(self.corrections, "correction"), (self.newton_steps, "Newton step")]
-        told = [f"{n} {what}{'' if n == 1 else 's'}" for n, what in parts if n or what == "correction"]
+        told = [counted(n, what) for n, what in parts if n or what == "correction"]
         where = f" where they move a frame by more than {100 * self.solved_beyond:g} %" if self.solved_beyond else ""
         ends = [f", then the solver{where}"] * self.solved + [f", in {self.precision}"] * (self.precision != "float32")
         return ", up to ".join(told) + "".join(ends)
@@ -213,7 +213,7 @@ def _mean(values: Sequence[float | None]) -> float | None:
 
 def can_make_newton_steps(config: ModelConfig) -> bool:
     """Whether the scenes of a model that jumps are tetrahedra of a material whose law is known."""
-    return bool(config.scheme.corrects and config.data.tetrahedra and config.data.material.law)
+    return not _lacks_for_newton_steps(config)
 
 
 def can_be_solved(config: ModelConfig) -> bool:
@@ -221,14 +221,20 @@ def can_be_solved(config: ModelConfig) -> bool:
     return not _lacks_for_solver(config)
 
 
-def _lacks_for_solver(config: ModelConfig) -> list[str]:
-    """What keeps the solver from ending an answer."""
+def _lacks_for_newton_steps(config: ModelConfig) -> list[str]:
+    """What keeps Newton steps from following an answer."""
     lacks = [] if config.scheme.corrects else ["its model does not jump"]
     lacks += [] if config.data.tetrahedra else ["its elements are no tetrahedra"]
     try:
         config.data.material.require_law()
     except ConfigError as error:
         lacks.append(str(error))
+    return lacks
+
+
+def _lacks_for_solver(config: ModelConfig) -> list[str]:
+    """What keeps the solver from ending an answer."""
+    lacks = _lacks_for_newton_steps(config)
     if config.data.contact_range <= 0:
         lacks.append("the range of contact is not known, which the bundled solver records with the scenes it makes")
     return lacks

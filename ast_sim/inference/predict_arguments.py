@@ -106,14 +106,10 @@ def _loose(scene: Scene) -> list[str]:
     loose = ~scene.prescribed
     loose[scene.elements.ravel()] = False
     count = int(loose.sum())
-    return (
-        [
-            f"{counted(count, 'free node belongs', 'free nodes belong')} to no element: what is predicted for them"
-            " means nothing"
-        ]
-        if count
-        else []
-    )
+    if not count:
+        return []
+    told = counted(count, "free node belongs", "free nodes belong")
+    return [f"{told} to no element: what is predicted for them means nothing"]
 
 
 def _at_rest(scene: Scene) -> list[str]:

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ast_sim.importers.decks.deck_axes import from_angles
 from ast_sim.support.errors import DatasetError
 
 # Nastran writes 1.5-3 for 1.5e-3, and 1.5D-3.
@@ -74,13 +75,10 @@ class NastranPoints:
         if system in _BASIC:
             return values
         letter, origin, axes = self._axes(system, place, within)
-        if letter == "C":
-            angle = np.radians(values[1])
-            values = np.array([values[0] * np.cos(angle), values[0] * np.sin(angle), values[2]])
-        elif letter == "S":
-            polar, angle = np.radians(values[1:])
-            flat = values[0] * np.sin(polar)
-            values = np.array([flat * np.cos(angle), flat * np.sin(angle), values[0] * np.cos(polar)])
+        if letter == "S":  # the second coordinate is the angle from the z axis, the third the one around it
+            values = np.array([values[0], values[2], 90 - values[1]])
+        if letter != "R":
+            values = from_angles(values[None], letter == "S")[0]
         return origin + values @ axes
 
     def _axes(self, system: str, place: str, within: tuple[str, ...]) -> tuple[str, np.ndarray, np.ndarray]:

@@ -136,15 +136,19 @@ class ContactForces:
 def free_of_themselves(scene: Scene, contact_range: float) -> tuple[int, ...]:
     """The bodies that can touch themselves: they deform, and no wall or slit of them is thinner at rest than the range
     of contact, where its barriers would act. ipctk must be installed."""
+    deforming = np.unique(scene.body[scene.deforming_nodes]).tolist()
+    return tuple(body for body in deforming if not presses_itself_at_rest(scene, body, contact_range))
+
+
+def presses_itself_at_rest(scene: Scene, body: int, contact_range: float) -> bool:
+    """Whether a wall, a slit or an element of a body is thinner at rest than the range of contact. ipctk must be
+    installed."""
     rest = scene.rest_position.astype(np.float64)
     surface = scene.surface()
-    free = []
-    for body in np.unique(scene.body[scene.deforming_nodes]).tolist():
-        of_body = surface[scene.body[surface[:, 0]] == body]
-        contact = Contact(rest, of_body, scene.body, ContactSettings(contact_range, 1.0, self_contact=True))
-        contact.collision_free_fraction(rest, rest)
-        free += [body] * contact.at(rest).is_empty
-    return tuple(free)
+    of_body = surface[scene.body[surface[:, 0]] == body]
+    contact = Contact(rest, of_body, scene.body, ContactSettings(contact_range, 1.0, self_contact=True))
+    contact.collision_free_fraction(rest, rest)
+    return not contact.at(rest).is_empty
 
 
 class _BarrierPairs:

@@ -11,6 +11,7 @@ import numpy as np
 
 from ast_sim.mechanics.case import SolidCase
 from ast_sim.mechanics.contact_and_friction import Contact, ContactSettings
+from ast_sim.mechanics.linearised.contact_forces import presses_itself_at_rest
 from ast_sim.number_arrays import point
 from ast_sim.plausibility.overlaps import deepest_node
 from ast_sim.simulate.own_assembly.assembly_spec import AssemblySpec
@@ -39,7 +40,7 @@ def check(spec: AssemblySpec, case: SolidCase, shared: Reference) -> None:
     rest = case.scene.rest_position.astype(np.float64)
     for pair in combinations(range(len(spec.parts)), 2):
         _check_apart(spec, case, rest, pair, shared)
-    _check_self_contact(spec, case, rest)
+    _check_self_contact(spec, case)
 
 
 def _check_held(spec: AssemblySpec, case: SolidCase) -> None:
@@ -105,13 +106,10 @@ def _check_apart(
         )
 
 
-def _check_self_contact(spec: AssemblySpec, case: SolidCase, rest: np.ndarray) -> None:
+def _check_self_contact(spec: AssemblySpec, case: SolidCase) -> None:
     bodies = case.contact.self_contact
     for number in () if isinstance(bodies, bool) else bodies:
-        settings = ContactSettings(case.contact.dhat, 1.0, self_contact=True)
-        contact = Contact(rest, surface_of(case, number), case.scene.body, settings)
-        contact.collision_free_fraction(rest, rest)
-        if not contact.at(rest).is_empty:
+        if presses_itself_at_rest(case.scene, number, case.contact.dhat):
             raise BadAssembly(
                 f"{spec.parts[number].name}: a wall, slit or element is thinner than the contact distance"
                 f" {case.contact.dhat:g} {spec.unit}: give a smaller contact_distance, or no self_contact"
