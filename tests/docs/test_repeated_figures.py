@@ -1,0 +1,79 @@
+"""Figures that the README and the page on efforts repeat are the ones of the committed results."""
+
+import json
+import re
+from pathlib import Path
+from statistics import median
+
+from benchmarks.studies import clip_page
+
+ROOT = Path(__file__).parents[2]
+README, EFFORTS, SCENES = (
+    (ROOT / page).read_text(encoding="utf-8")
+    for page in ("README.md", "docs/how-to/choose-effort.md", "docs/how-to/predict-a-scene.md")
+)
+QUANTITIES = ("displacement", "reaction", "stress")
+
+
+def results(name: str) -> dict:
+    return json.loads((ROOT / "benchmarks" / "results" / f"{name}.json").read_text(encoding="utf-8"))
+
+
+def numbers(pattern: str, page: str) -> tuple[float, ...]:
+    """The numbers in the one place of a page that a pattern describes, whatever its line breaks."""
+    (place,) = re.findall(pattern, " ".join(page.split()))
+    return tuple(map(float, (place,) if isinstance(place, str) else place))
+
+
+def test_every_comparison_of_bands_is_counted():
+    levels = [
+        one for result in results("coverage").values() for row in result["rows"] for one in row["levels"].values()
+    ]
+    assert all(one["held_interval_99"][0] <= one["held"] <= one["held_interval_99"][1] for one in levels)
+    assert numbers(r"In all (\d+) comparisons", README) == (len(levels),)
+
+
+def test_errors_and_times_of_efforts():
+    coverage, trade = results("coverage")["plates"], results("trade")["plates400"]["displacement"]["run"]
+    rows = re.findall(r"^\| .*? \| ([\d.]+) % \| ([\d.]+) % \| ([\d.]+) % \| (\d+) ms \|$", EFFORTS, re.MULTILINE)
+    assert len(rows) == len(coverage["efforts"]) == len(trade)
+    for place, (row, of_trade) in enumerate(zip(rows, trade, strict=True)):
+        assert coverage["efforts"][place] == of_trade["name"]
+        kept = [coverage["kept"][quantity][place] for quantity in QUANTITIES]
+        shown = [float(f"{100 * error:.{2 if error > 1e-4 else 1}g}") for error in kept]
+        assert [float(cell) for cell in row] == [*shown, round(1000 * median(of_trade["seconds"]))]
+    one, two = (trade[place]["errors"] for place in (1, 2))
+    same = sum(first == second for first, second in zip(one, two, strict=True))
+    assert numbers(r"in (\d+) of (\d+) plates the first step is small", EFFORTS) == (same, len(one))
+
+
+def test_pairs_of_parts_and_where_the_solver_ends_them():
+    figures = results("trade")["parts400"]["displacement"]
+    tenth = len(figures["scenes"]) // 10
+    kept = {one["name"]: sorted(one["errors"])[-1 - tenth] for one in figures["run"]}
+    assert numbers(r"more than a tenth of (\d+) new pairs its error stays above 10 %", README) == (
+        len(figures["scenes"]),
+    )
+    assert all(error > 0.1 for name, error in kept.items() if "solver" not in name)
+    ended = "0 corrections, up to 10 Newton steps, then the solver where they move a frame by more than 10 %"
+    assert "nine in ten pairs stay within 5 %" in README and kept[ended] <= 0.05
+    assert {row["verdict"] for row in figures["rows"]} == {"level", "the solver alone"}
+
+
+def test_both_sides_of_the_clip_pay_beside_the_same_solver():
+    page = clip_page.page(results("clip"))
+    counts = numbers(r"in the dataset, the run pays after (\d+) questions, the Gaussian process, .*?after (\d+)", page)
+    assert numbers(r"after (\d+) predictions, the Gaussian process its simulations after (\d+)", README) == counts
+
+
+def test_the_error_of_the_mesh_that_a_trade_estimates():
+    trade = results("trade")
+    estimates = [round(100 * median(trade[row]["reaction"]["mesh_errors"])) for row in ("plates400", "plates1300")]
+    shown = numbers(r"of 400 nodes it is (\d+) %, where the error is 96 %; at 1,300 nodes (\d+) %", EFFORTS)
+    assert list(shown) == estimates
+
+
+def test_newton_steps_end_near_the_solver():
+    of_scenes = [scene["relative_error"] for scene in results("jumps")["plates400_long"]["scenes"]]
+    shown = (float(f"{100 * median(of_scenes):.1g}"), len(of_scenes))
+    assert numbers(r"\(([\d.]+) % off in the median of (\d+) plates\)", SCENES) == shown
