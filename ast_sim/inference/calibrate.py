@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ast_sim.dataset.reader import Dataset
+from ast_sim.inference.answer import Answer
 from ast_sim.inference.effort import Effort, choices
 from ast_sim.inference.predict_arguments import new_question
 from ast_sim.inference.promises.calibration import Calibration
@@ -184,14 +185,21 @@ def _measured_scene(
     """A calibration scene."""
     answers = [run.predict(truth, effort=effort, throw=False, name=name, progress=False) for effort in efforts]
     comparisons = [None if one.failure is not None else compared(one, truth) for one in answers]
-    deepest = deepest_frame(truth)
-    alone = [
-        run.predict(truth, frames=deepest, effort=effort, throw=False, name=name, progress=False)
-        for effort in to_choose
+    errors = [
+        _errors_alone(run, truth, name, effort, answer) for effort, answer in zip(to_choose, answers, strict=False)
     ]
-    errors = [None if one.failure is not None else one.errors(truth) for one in alone]
     latents = np.stack(list(answers[0].latents.values())) if answers[0].latents else None
     return _Measured(comparisons, errors, spacing_of(truth.scene), latents)
+
+
+def _errors_alone(run: Run, truth: Trajectory, name: str, effort: Effort, whole: Answer) -> dict[str, float] | None:
+    """The errors at the deepest frame where it alone is predicted; None: the prediction failed. Without friction the
+    other frames have no say in a frame, so the answer with all frames, `whole`, has the same one."""
+    if run.settings.model.data.rubs or whole.failure is not None:
+        deepest = deepest_frame(truth)
+        alone = run.predict(truth, frames=deepest, effort=effort, throw=False, name=name, progress=False)
+        return None if alone.failure is not None else alone.errors(truth)
+    return whole.errors(truth)
 
 
 def _kept_errors(efforts: Sequence[Effort], errors: Sequence[Sequence[Mapping[str, float] | None]]) -> KeptErrors:

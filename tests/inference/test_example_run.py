@@ -51,6 +51,19 @@ def test_it_predicts_a_new_plate_by_one_call_and_better_with_newton_steps(tmp_pa
     ]  # fmt: skip
 
 
+def test_without_friction_a_frame_is_the_same_alone_and_among_all(tmp_path):
+    """So a calibration takes the errors of the deepest frame from the answer with all frames."""
+    data = tmp_path / "plates.h5"
+    ast_sim.generate("deforming_plate", data, train=0, valid=0, test=1, nodes=400, frames=41, keep=(14, 24), seed=5)
+    run = ast_sim.example_run("plates")
+    with ast_sim.Dataset(data) as dataset:
+        truth = dataset["test"][0]
+    steps = ast_sim.Effort(newton_steps=10)
+    for effort in (ast_sim.Effort(), steps, replace(steps, solved=True, solved_beyond=1e-3), ast_sim.Effort.exact()):
+        among, alone = run.predict(truth, effort=effort), run.predict(truth, frames=-1, effort=effort)
+        assert np.array_equal(among.position[-1], alone.position[0]) and among.errors(truth) == alone.errors(truth)
+
+
 def test_a_clip_that_is_asked_for_by_its_parameters_has_the_set_and_the_force_of_calculix():
     """Test scenes of the study, which no training has seen; benchmarks/results/clip.json has what CalculiX found."""
     run = ast_sim.example_run("clip")
