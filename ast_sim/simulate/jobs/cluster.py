@@ -29,7 +29,7 @@ from ast_sim.simulate.jobs import pool
 from ast_sim.simulate.jobs.manifest import Watch
 from ast_sim.simulate.jobs.recipe import difference, recorded
 from ast_sim.simulate.jobs.samples import Recipe, Sample, load_sample, sample_name, sample_path, store_sample
-from ast_sim.support.errors import ConfigError, SimulationError, require
+from ast_sim.support.errors import AstSimError, ConfigError, SimulationError, require
 
 SECONDS_TO_CONNECT = 10.0
 SECONDS_BETWEEN_EVENTS = 5.0
@@ -39,7 +39,8 @@ def run_all(samples: list[Sample], parts: Path, recipe: Recipe, scheduler: str, 
     """Have the cluster make the samples and store them in `parts`; `watch` is told about each.
 
     Raises:
-        SimulationError: the scheduler cannot be reached or goes away, or a sample cannot be stored.
+        AstSimError: the scheduler goes away, or a sample cannot be stored.
+        ConfigError: the scheduler cannot be reached.
         MissingExtra: `distributed` is not installed.
     """
     settings = recorded(recipe)
@@ -77,7 +78,7 @@ def _connected(scheduler: str) -> Iterator[Any]:
         try:
             client = distributed.Client(scheduler, timeout=SECONDS_TO_CONNECT, set_as_default=False, name="ast_sim")
         except (OSError, ValueError, TypeError) as error:
-            raise SimulationError(
+            raise ConfigError(
                 f"the scheduler at {scheduler} cannot be reached within {SECONDS_TO_CONNECT:g} s ({error}):"
                 " is `dask scheduler` running there, and does the address read like tcp://host:8786?"
             ) from error
@@ -115,7 +116,7 @@ def _hear(event: dict[str, Any], waiting: set[Sample], watch: Watch) -> None:
 def _end(future: Any, sample: Sample, parts: Path, scheduler: str, watch: Watch) -> None:
     """Store the result of a task, or note why it has none."""
     if future.status in ("cancelled", "lost"):
-        raise SimulationError(
+        raise AstSimError(
             f"the scheduler at {scheduler} went away. The finished samples are kept in {parts}: the same command goes"
             " on from there"
         )
@@ -131,7 +132,7 @@ def _end(future: Any, sample: Sample, parts: Path, scheduler: str, watch: Watch)
     try:
         store_sample(sample_path(parts, *sample), answer["sample"])
     except OSError as error:
-        raise SimulationError(f"{sample_name(*sample)} cannot be written: {error}") from error
+        raise AstSimError(f"{sample_name(*sample)} cannot be written: {error}") from error
     load_sample(sample_path(parts, *sample))
     watch.done(sample)
 

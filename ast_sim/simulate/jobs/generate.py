@@ -44,7 +44,7 @@ from ast_sim.simulate.jobs.samples import (
 from ast_sim.simulate.own_assembly.spec_reader import read_spec
 from ast_sim.support.argument_checks import file_name, require_bool
 from ast_sim.support.disk import output_file, replacing
-from ast_sim.support.errors import ConfigError, SimulationError, counted
+from ast_sim.support.errors import AstSimError, ConfigError, DatasetError, SimulationError, counted
 from ast_sim.support.progress import ShowProgress, require_progress
 from ast_sim.support.toml_settings import require_range, required_whole, whole
 
@@ -97,18 +97,17 @@ def generate(
         nodes, frames: about how many nodes and how many frames a scene has; None: as the family or specification has.
         keep: ascending numbers of the frames to solve, straight from one to the next, and store; all frames if None.
         order: of the tetrahedra, 1 (four nodes) or 2 (ten nodes), for families that have this option; 1 if None.
-        workers: number of processes; one per available core if None.
+        workers, scheduler: number of processes, by default one per core; or the address of a Dask scheduler instead.
         solver: "own" or "calculix", for families of solids; if None, "own", but "calculix" if a part is elastoplastic.
         parts: a file or folder of parts (STEP, STL, meshes), for families that squeeze parts; None: drawn ones.
         spec: the specification of an assembly (TOML), for the family "assembly".
         patient: solve every scene to its last frame. Else a scene ends before a frame of over 500 Newton iterations.
-        scheduler: address of a Dask scheduler. Its workers make the samples; no processes start on this machine.
         progress: True: a bar on a terminal, lines elsewhere; False: nothing; or a function of (done, total, text).
 
     Raises:
-        AstSimError: `out` is no place for a file.
-        ConfigError: a setting is invalid, or `out` was made with other settings.
-        SimulationError: the disk is too small, `out` is in use, or samples failed: the same call goes on from there.
+        AstSimError: `out` is no place for a file, in use or damaged; the disk is too small; a file cannot be written.
+        ConfigError: a setting is invalid, `out` was made with other settings, or the scheduler cannot be reached.
+        SimulationError: samples failed: the same call goes on from there.
         MissingExtra: a package that the family, the solver or the scheduler needs is not installed.
     """
     module = family_module(family)
@@ -124,7 +123,8 @@ def generate(
     _check_start(out, folder, sum(counts.values()), recipe, module)
     with _locked(folder, settings):
         _unpack(out, folder)
-        _make(samples := _samples(counts), folder, recipe, workers, scheduler, progress, _notes(recipe, settings))
+        samples = _samples(counts)
+        _make(samples, folder, recipe, workers, scheduler, progress, _notes(recipe, settings))
         opened = _writer(out, recipe, module, {**settings, "counts": counts})
         return Generated(out, counts, _merge(out, folder, samples, opened))
 
@@ -225,7 +225,7 @@ def _check_start(out: Path, made: Path, scenes: int, recipe: Recipe, module: Mod
     folder = next(parent for parent in out.absolute().parents if parent.exists())
     least, free = 16 * scenes * nodes * frames, shutil.disk_usage(folder).free
     if least > free:
-        raise SimulationError(
+        raise AstSimError(
             f"{counted(scenes, 'scene needs', 'scenes need')} more than {least / 1e9:,.3f} GB, but {folder} has"
             f" {free / 1e9:,.3f} GB: make fewer or smaller scenes, or choose another disk"
         )
@@ -280,12 +280,12 @@ def _locked(folder: Path, settings: dict[str, Any]) -> Iterator[None]:
         folder.mkdir(parents=True, exist_ok=True)
         lock = open(folder / "lock", "w")  # noqa: SIM115 (closed below, also on an error)
     except OSError as error:
-        raise SimulationError(f"{folder} cannot be written: {error}") from error
+        raise AstSimError(f"{folder} cannot be written: {error}") from error
     with lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise SimulationError(f"{folder} is in use by another process that generates the same file") from None
+            raise AstSimError(f"{folder} is in use by another process that generates the same file") from None
         path = folder / "settings.json"
         if path.exists():
             differs = difference(_read_settings(path), settings)
@@ -298,7 +298,7 @@ def _locked(folder: Path, settings: dict[str, Any]) -> Iterator[None]:
                 with replacing(path) as temporary:
                     temporary.write_text(json.dumps(settings))
             except OSError as error:
-                raise SimulationError(f"{path} cannot be written: {error}") from error
+                raise AstSimError(f"{path} cannot be written: {error}") from error
         for leftover in folder.glob(".*"):  # files that a killed process had not finished
             leftover.unlink(missing_ok=True)
         yield
@@ -308,7 +308,7 @@ def _read_settings(path: Path) -> dict[str, Any]:
     try:
         return dict(json.loads(path.read_text()))
     except (OSError, ValueError, TypeError) as error:
-        raise SimulationError(f"{path} is damaged ({error}): remove the folder") from error
+        raise DatasetError(f"{path} is damaged ({error}): remove the folder") from error
 
 
 def _remove(folder: Path) -> None:

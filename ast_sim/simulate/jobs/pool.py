@@ -16,7 +16,7 @@ from typing import Any
 from ast_sim.simulate.jobs.manifest import Watch
 from ast_sim.simulate.jobs.samples import Recipe, Sample, sample_name
 from ast_sim.support.environment import SINGLE_THREAD, of_child
-from ast_sim.support.errors import SimulationError
+from ast_sim.support.errors import AstSimError
 
 WORKER_MODULE = "ast_sim.simulate.jobs.worker"
 
@@ -134,7 +134,7 @@ class WorkerPool:
             self.watch.progress(worker.sample, *message["progress"])
             return
         if message.get("fatal"):
-            raise SimulationError(f"{sample_name(*worker.sample)} cannot be written: {message['error']}")
+            raise AstSimError(f"{sample_name(*worker.sample)} cannot be written: {message['error']}")
         if "error" in message:
             self.watch.failed(worker.sample, message["error"], message.get("traceback", ""))
         else:
@@ -151,7 +151,7 @@ def run_all(samples: list[Sample], parts: Path, recipe: Recipe, workers: int, wa
     """Make the samples and store them in `parts`; `watch` is told about each.
 
     Raises:
-        SimulationError: an error that every sample would meet, such as a full disk.
+        AstSimError: an error that every sample would meet, such as a full disk.
     """
     pool = WorkerPool(samples, parts, recipe, watch)
     try:

@@ -16,7 +16,7 @@ from ast_sim.simulate.jobs import cluster
 from ast_sim.simulate.jobs.display import SceneProgress
 from ast_sim.simulate.jobs.generate import generate
 from ast_sim.simulate.jobs.recipe import recorded
-from ast_sim.support.errors import MissingExtra, SimulationError
+from ast_sim.support.errors import AstSimError, ConfigError, MissingExtra, SimulationError
 
 COUNTS = {"train": 2, "valid": 0, "test": 1}
 SETTINGS = {"seed": 5, "nodes": 80, "frames": 9, "progress": False}
@@ -126,8 +126,9 @@ def test_a_scheduler_that_goes_away_is_one_clear_error(tmp_path, monkeypatch, ca
         line(bar, text)
 
     monkeypatch.setattr(SceneProgress, "line", kill_the_scheduler)
-    with pytest.raises(SimulationError, match=f"scheduler at {address} went away. The finished samples are kept in"):
+    with pytest.raises(AstSimError, match=f"scheduler at {address} went away. The finished samples are kept") as caught:
         generate("deforming_plate", tmp_path / "plates.h5", **COUNTS, scheduler=address, **SETTINGS)
+    assert type(caught.value) is AstSimError
     assert process.returncode == -signal.SIGKILL
     assert "Traceback" not in capfd.readouterr().err
 
@@ -148,7 +149,7 @@ def test_a_scheduler_that_cannot_be_reached(tmp_path, monkeypatch, address):
     with socket.socket() as taken:  # bound, but nobody listens
         taken.bind(("127.0.0.1", 0))
         address = address.format(port=taken.getsockname()[1])
-        with pytest.raises(SimulationError, match=f"the scheduler at {address} cannot be reached within 0.5 s"):
+        with pytest.raises(ConfigError, match=f"the scheduler at {address} cannot be reached within 0.5 s"):
             generate("deforming_plate", tmp_path / "a.h5", train=1, valid=0, test=0, scheduler=address, **SETTINGS)
 
 

@@ -4,10 +4,12 @@ import hashlib
 import json
 import os
 import pathlib
+import shutil
 import signal
 import subprocess
 import sys
 from dataclasses import replace
+from types import SimpleNamespace
 
 import data_samples
 import meshio
@@ -25,7 +27,7 @@ from ast_sim.simulate.jobs.generate import generate
 from ast_sim.simulate.jobs.manifest import Manifest
 from ast_sim.simulate.jobs.recipe import recipe_of, recorded
 from ast_sim.simulate.jobs.samples import Recipe, draw_sample, load_sample, make_sample, sample_path, save_sample
-from ast_sim.support.errors import ConfigError, MissingExtra, SimulationError, require
+from ast_sim.support.errors import AstSimError, ConfigError, DatasetError, MissingExtra, SimulationError, require
 
 NODES, FRAMES = 80, 9
 RECIPE = Recipe("deforming_plate", 5, NODES, FRAMES)
@@ -164,8 +166,9 @@ def test_a_disk_that_cannot_be_written_stops_the_run(tmp_path, monkeypatch):
         give(worker, sample)
 
     monkeypatch.setattr(pool.Worker, "give", remove_folder)
-    with pytest.raises(SimulationError, match="train/000000 cannot be written: FileNotFoundError"):
+    with pytest.raises(AstSimError, match="train/000000 cannot be written: FileNotFoundError") as caught:
         plates(tmp_path / "a.h5", {"train": 2}, workers=1)
+    assert type(caught.value) is AstSimError
 
 
 def test_parts_of_other_settings_are_refused(tmp_path):
@@ -179,7 +182,7 @@ def test_parts_of_other_settings_are_refused(tmp_path):
     with pytest.raises(ConfigError, match=r"other settings \(versions: numpy 1.0 there, [2-9].* here\)"):
         plates(out, {"train": 1})
     (folder / "settings.json").write_text("{")
-    with pytest.raises(SimulationError, match="settings.json is damaged"):
+    with pytest.raises(DatasetError, match="settings.json is damaged"):
         plates(out, {"train": 1})
 
 
@@ -318,8 +321,21 @@ def test_calculix_keeps_frames_too():
 def test_two_runs_on_one_file_exclude_each_other(tmp_path):
     out = tmp_path / "plates.h5"
     locked = generate_module._locked(tmp_path / "plates.h5.parts", recorded(RECIPE))
-    with locked, pytest.raises(SimulationError, match="in use by another process"):
+    with locked, pytest.raises(AstSimError, match="in use by another process") as caught:
         plates(out, {"train": 1})
+    assert type(caught.value) is AstSimError  # no solve has failed
+
+
+def test_a_folder_without_room_or_in_whose_place_a_file_lies_is_no_failed_solve(tmp_path, monkeypatch):
+    with monkeypatch.context() as patched:
+        patched.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=0))
+        with pytest.raises(AstSimError, match="2 scenes need more than 0.000 GB, but .* has 0.000 GB") as caught:
+            plates(tmp_path / "a.h5", {"train": 2})
+    assert type(caught.value) is AstSimError
+    (tmp_path / "b.h5.parts").write_text("")
+    with pytest.raises(AstSimError, match="b.h5.parts cannot be written: .*File exists") as caught:
+        plates(tmp_path / "b.h5", {"train": 2})
+    assert type(caught.value) is AstSimError
 
 
 @pytest.mark.parametrize(
