@@ -94,10 +94,14 @@ class Effort:
     def text(self) -> str:
         """Such as "2 corrections, up to 1 Newton step, then the solver"."""
         parts = [(self.corrections, "correction"), (self.newton_steps, "Newton step")]
-        told = [counted(n, what) for n, what in parts if n or what == "correction"]
-        where = f" where they move a frame by more than {100 * self.solved_beyond:g} %" if self.solved_beyond else ""
-        ends = [f", then the solver{where}"] * self.solved + [f", in {self.precision}"] * (self.precision != "float32")
-        return ", up to ".join(told) + "".join(ends)
+        told = ", up to ".join(counted(n, what) for n, what in parts if n or what == "correction")
+        if self.solved:
+            told += ", then the solver"
+        if self.solved_beyond:
+            told += f" where they move a frame by more than {100 * self.solved_beyond:g} %"
+        if self.precision != "float32":
+            told += f", in {self.precision}"
+        return told
 
     def check(self, config: ModelConfig) -> None:
         """Raise ConfigError if the model cannot make this effort."""
@@ -145,10 +149,10 @@ def option(dial: str) -> str:
 
 def options_of(effort: Effort) -> list[str]:
     """The options that ask for an effort on the command line."""
-    precision = ["--precision", effort.precision] * (effort.precision != "float32")
+    precision = [] if effort.precision == "float32" else ["--precision", effort.precision]
     if replace(effort, precision="float32") == Effort.exact():
         return ["--exact", *precision]
-    beyond = ["--solved-beyond", f"{effort.solved_beyond:g}"] * (effort.solved_beyond > 0)
+    beyond = ["--solved-beyond", f"{effort.solved_beyond:g}"] if effort.solved_beyond else []
     return [text for dial in DIALS for text in (option(dial), str(getattr(effort, dial)))] + beyond + precision
 
 
@@ -161,14 +165,14 @@ class EffortErrors:
         error: of the displacement, relative to it; None: the prediction failed.
         stress_error: of the stress, relative to the error of the frame's true mean; None: there is no stress.
         steps: the Newton steps that were made.
-        unsettled: the share of the scenes in which the Newton steps have not converged.
+        not_converged: the share of the scenes in which the Newton steps have not converged.
     """
 
     effort: Effort
     error: float | None
     stress_error: float | None
     steps: float
-    unsettled: float
+    not_converged: float
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> Self:
@@ -186,7 +190,7 @@ def mean_errors(of_scenes: Sequence[Sequence[EffortErrors]]) -> list[EffortError
                 _mean([one.error for one in same]),
                 _mean([one.stress_error for one in same]),
                 fmean(one.steps for one in same),
-                fmean(one.unsettled for one in same),
+                fmean(one.not_converged for one in same),
             )
         )
     return means
@@ -282,6 +286,6 @@ def cheapest_good(measured: Sequence[EffortErrors]) -> Effort:
     accurate = [one for one, error in errors.items() if error <= enough]
     both = [one for one in accurate if stresses[one] <= enough_stress]
     good = both or accurate
-    fewest = min(one.unsettled for one in good)
-    converged = [one for one in good if one.unsettled <= fewest]
+    fewest = min(one.not_converged for one in good)
+    converged = [one for one in good if one.not_converged <= fewest]
     return min(converged, key=lambda one: (one.effort.corrections + one.steps, one.effort.corrections)).effort

@@ -114,7 +114,7 @@ def test_newton_steps_lead_from_the_answer_to_equilibrium(pressed, monkeypatch):
     assert np.array_equal(answer.position[0][held], truth.position[frame][held])
     measured = errors_by_effort(model, truth, [Effort(0, 3), Effort(1, 3)])
     assert [one.effort for one in measured] == [Effort(c, k) for c in (0, 1) for k in range(4)]
-    assert [one.unsettled for one in measured] == [0, 1, 1, 0] * 2
+    assert [one.not_converged for one in measured] == [0, 1, 1, 0] * 2
     assert [one.steps for one in measured] == [0, 1, 2, 3] * 2
     assert measured[7].stress_error == pytest.approx(found.stress_share)
     assert measured[5].stress_error > 1.1 * measured[7].stress_error
@@ -234,10 +234,12 @@ def test_a_quiet_prediction_says_nothing_of_newton_steps_that_take_long(pressed,
     assert f"plate frame {deepest_frame(truth)}: Newton step 2 of at most 2\n" in capfd.readouterr().err
 
 
-def measured(errors, stresses, steps, unsettled):
+def measured(errors, stresses, steps, not_converged):
     """What `cheapest_good` takes, from tables by corrections and Newton steps."""
     return [
-        EffortErrors(Effort(c, k), error, None if stresses is None else stresses[c][k], steps[c][k], unsettled[c][k])
+        EffortErrors(
+            Effort(c, k), error, None if stresses is None else stresses[c][k], steps[c][k], not_converged[c][k]
+        )
         for c, row in enumerate(errors)
         for k, error in enumerate(row)
     ]
