@@ -55,11 +55,12 @@ def outputs_of(name):
 
 
 def test_ask_a_run():
-    """Each object shows itself as a table, the error falls with the effort, and the plate from below is told."""
+    """Each object shows a table and a picture, the error falls with the effort, and the plate from below is told."""
     outputs, text = outputs_of("ask_a_run.ipynb")
     shown = [output["data"]["text/html"] for output in outputs if "text/html" in output.get("data", {})]
     kinds = ["Run", "Scene", "Answer", "Dataset", "Split", "Trajectory", "Evaluation"]
     assert [kind for kind, table in zip(kinds, shown, strict=True) if f"{kind}</" in table] == kinds
+    assert [kind for kind, table in zip(kinds, shown, strict=True) if "<svg" in table or "<img" in table] == kinds
     errors = {
         line.split(":")[0]: float(line.split(": ")[1].split()[0]) for line in text.splitlines() if "off, " in line
     }

@@ -167,4 +167,6 @@ def test_a_dataset_and_a_split_show_their_first_scene(tmp_path):
 
 def test_bars_are_as_high_as_their_values():
     bars = ElementTree.fromstring(re.search("<svg.*</svg>", html_bars([1.0, 4.0, 0.0], "<e>"))[0])
-    assert [bar.get("height") for bar in bars] == ["25", "100", "0"] and "&lt;e&gt;" in html_bars([], "<e>")
+    assert [bar.get("height") for bar in bars] == ["25", "100", "0"] and "&lt;e&gt;" in html_bars([1.0], "<e>")
+    assert html_bars([], "<e>") == ""
+    assert html_bars([9.0] + 100 * [1.0], "").count('height="100" fill') == 100

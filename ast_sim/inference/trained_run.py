@@ -32,7 +32,7 @@ from ast_sim.scene import Scene, Trajectory
 from ast_sim.simulate.own_assembly.grid import required_values, rows_of
 from ast_sim.support.argument_checks import file_name, require_bool, require_type, several
 from ast_sim.support.errors import ConfigError, RolloutError, warn
-from ast_sim.support.notebook_table import html_table, one_line
+from ast_sim.support.notebook_table import html_bars, html_table, one_line
 from ast_sim.support.progress import Progress, ShowProgress
 from ast_sim.support.provenance import provenance
 from ast_sim.support.toml_settings import NOTHING, required_whole
@@ -86,7 +86,8 @@ class Run:
         return one_line("Run", self._facts())
 
     def _repr_html_(self) -> str:
-        return html_table("Run", self._facts())
+        bars = html_bars(self.folder.metrics.valid_errors(), "displacement error by validation")
+        return html_table("Run", self._facts(), bars)
 
     def save(self, path: str | os.PathLike[str], licence: str | None = None) -> None:
         """Write the run as one file, `NAME.ast`, that `Run("NAME.ast")` opens on any machine.
@@ -264,7 +265,7 @@ class Run:
         progress: ShowProgress,
     ) -> list[Answer]:
         """The answers with their units, their origin, to which `facts` of each belong, and the error that is to be
-        expected. What is unusual is told as warnings; `began` is when the questions were asked."""
+        expected. What is unusual is told as warnings; `began` is when the call began."""
         require_bool(throw=throw)
         for question in questions:
             for note in question.notes:
@@ -285,11 +286,12 @@ class Run:
                 origin["expected_error"] = expected
             bands = {} if self.calibration is None else self.calibration.bands(answer, effort, notes)
             shared = {"info": self.info, "expected_error": expected, "seconds": seconds, "bands": bands}
-            told.append(answer := dataclasses.replace(answer, source=origin, notes=notes, p_value=p_value, **shared))
-            if answer.failure is not None and throw:
-                raise RolloutError(answer.failure, answer)
-            for doubt in (*unlike, *doubts(answer)):
-                warn(f"{answer.name}: {doubt}")
+            complete = dataclasses.replace(answer, source=origin, notes=notes, p_value=p_value, **shared)
+            if complete.failure is not None and throw:
+                raise RolloutError(complete.failure, complete)
+            for doubt in (*unlike, *doubts(complete)):
+                warn(f"{complete.name}: {doubt}")
+            told.append(complete)
         return told
 
     def expected_error(self, effort: Effort) -> float | None:

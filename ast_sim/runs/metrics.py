@@ -74,6 +74,10 @@ class Metrics:
         succeeded = (record for record in self if record.get("valid_rmse") is not None)
         return min(succeeded, key=lambda record: record["valid_rmse"], default=None)
 
+    def valid_errors(self) -> list[float]:
+        """The errors of the validations that succeeded, in order."""
+        return [record["valid_rmse"] for record in self if record.get("valid_rmse") is not None]
+
     def validation(self, step: int) -> dict[str, Any] | None:
         """The record of the last validation after a step; None if there is none."""
         records = [record for record in self if record["step"] == step and "valid_rmse" in record]

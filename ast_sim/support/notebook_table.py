@@ -9,6 +9,8 @@ from typing import Any
 
 from ast_sim.support.errors import printable
 
+MOST_BARS = 100  # of a drawing
+
 
 def one_line(kind: str, facts: Mapping[str, Any]) -> str:
     """Such as "Scene(bodies: 2, nodes: 351)"."""
@@ -27,9 +29,12 @@ def html_table(title: str, facts: Mapping[str, Any], picture: str = "") -> str:
 
 
 def html_bars(values: Sequence[float], title: str) -> str:
-    """Bars in SVG, the highest 100 pixels high, with a title."""
-    largest = max(values, default=0.0) or 1.0
-    heights = [round(100 * value / largest, 1) for value in values]
+    """Bars in SVG of the last `MOST_BARS` values, the highest 100 pixels high, with a title; empty without values."""
+    if not values:
+        return ""
+    shown = values[-MOST_BARS:]
+    largest = max(shown) or 1.0
+    heights = [round(100 * value / largest, 1) for value in shown]
     bars = "".join(
         f'<rect x="{8 * place}" y="{100 - height:g}" width="6" height="{height:g}" fill="#4c8bc9"/>'
         for place, height in enumerate(heights)

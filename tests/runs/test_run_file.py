@@ -104,7 +104,12 @@ def test_a_run_shows_what_it_is(saved):
     shown = repr(Run(file))
     assert shown.startswith(f"Run(path: toy.ast, model: ast, {parameters:,} parameters, checkpoint: step {run.step}, ")
     assert f"family: toy_plate, lengths in m, effort: {run.effort.text}, expected error: " in shown
-    assert "<td" in run._repr_html_() and f"{parameters:,} parameters" in run._repr_html_()
+    errors = [one["valid_rmse"] for one in run.folder.metrics if "valid_rmse" in one]
+    heights = [f"{100 * error / max(errors):.1f}" for error in errors]
+    for one in (run, Run(file)):
+        table = one._repr_html_()
+        assert "<td" in table and f"{parameters:,} parameters" in table
+        assert [f"{float(height):.1f}" for height in re.findall(r'<rect [^>]*height="(\S+)"', table)] == heights != []
 
 
 def test_no_damage_is_silent(saved, tmp_path):

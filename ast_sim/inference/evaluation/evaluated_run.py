@@ -27,8 +27,6 @@ from ast_sim.view.page import page_name
 if TYPE_CHECKING:
     from ast_sim.inference.trained_run import Run
 
-MOST_BARS = 100  # of a drawing: the worst scenes
-
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
@@ -62,7 +60,7 @@ class Evaluation:
 
     def _repr_html_(self) -> str:
         errors = sorted(error for scene in self.figures.scenes if (error := scene.error("displacement")) is not None)
-        bars = html_bars(errors[-MOST_BARS:], "displacement error by scene") if errors else ""
+        bars = html_bars(errors, "displacement error by scene")
         return html_table("Evaluation", self._headline(), f"{bars}<pre>{escape(str(self))}</pre>")
 
     def save(self, path: str | os.PathLike[str]) -> None:
