@@ -1,7 +1,7 @@
 """The elastic forces that a guess leaves out of balance, as an input of the nodes.
 
-They are the right-hand side of Newton's method: where they are zero at the free nodes, and no contact acts, the guess
-is the answer.
+They are about the right-hand side of Newton's method. Their law is the one of St. Venant and Kirchhoff, with which the
+solver's law agrees at small strains only, and contact is left out.
 """
 
 from __future__ import annotations
