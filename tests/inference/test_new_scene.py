@@ -127,6 +127,15 @@ def with_positions(scene: Scene, positions: np.ndarray) -> Scene:
     return replace(scene, rest_position=positions.astype(np.float32))
 
 
+def test_what_read_scene_returns_is_predicted_like_its_scene(run):
+    read = read_scene(plate_and_punch(SIZE, CELLS, gap=0.008), **PRESCRIBED)
+    whole, alone = (run.predict(one, PRESS, num_frames=4) for one in (read, read.scene))
+    assert whole.scene is read.scene and whole.frames == alone.frames == (0, 1, 2, 3)
+    assert np.array_equal(whole.position, alone.position) and np.array_equal(whole.stress, alone.stress)
+    assert not np.array_equal(whole.position[3], whole.position[0])
+    assert whole.expected_error == alone.expected_error is not None and whole.notes == alone.notes == ()
+
+
 def test_a_scene_far_away_gets_the_same_answer_there(run, tmp_path):
     """Coordinates are multiples of 2^-12, so that float32 holds the moved ones exactly."""
     scene = scene_of()

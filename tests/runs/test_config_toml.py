@@ -6,9 +6,11 @@ import shutil
 import pytest
 import toy
 
+from ast_sim import Run
 from ast_sim.cli import main
 from ast_sim.runs import checkpoint
-from ast_sim.runs.config_toml import read_config, read_scope
+from ast_sim.runs import folder as folder_module
+from ast_sim.runs.config_toml import read_config, read_origin, read_scope
 from ast_sim.runs.folder import RunFolder
 from ast_sim.support.errors import CheckpointError, ConfigError
 from ast_sim.training import start
@@ -90,3 +92,25 @@ def test_a_whole_checkpoint_of_another_run_is_refused(trained, run):
     (run / "best").unlink()
     with pytest.raises(CheckpointError, match=r"is of a run with other settings|best"):
         RunFolder(run).load_model()
+
+
+def test_a_run_reads_each_of_its_files_once(run, tmp_path, monkeypatch):
+    """However often they are used, until it is opened again."""
+    calls = []
+
+    def counted(reader):
+        def read(path):
+            calls.append(reader.__name__)
+            return reader(path)
+
+        return read
+
+    for reader in (read_config, read_scope, read_origin):
+        monkeypatch.setattr(folder_module, reader.__name__, counted(reader))
+    for times in (1, 2):
+        opened = Run(run)
+        for _ in range(2):
+            opened.evaluate(solver_scenes=0, progress=False)
+            opened.save(tmp_path / "run.ast")
+            assert opened.info.family == "toy_plate" and opened.folder.specification is None
+        assert sorted(calls) == sorted(times * ["read_config", "read_scope", "read_origin"])

@@ -9,10 +9,12 @@ import meshio
 import numpy as np
 import pytest
 import pyvista
+import toy
 from data_samples import block, raised, trajectory
 from view_scenes import plate, strip
 from vtk_series import read
 
+from ast_sim.inference.answer import Answer
 from ast_sim.scene import Trajectory
 from ast_sim.support.errors import AstSimError, DatasetError
 from ast_sim.view import export
@@ -89,6 +91,27 @@ def test_errors_compare_the_frames_with_the_same_numbers(tmp_path, suffix):
     assert read(path)[0] == [0.25, 1.0]
     with pytest.raises(DatasetError, match="there is no frame 5; there are the frames 0 to 4"):
         export.write(path, truth, replace(some, frames=(4, 5)))
+
+
+@pytest.mark.parametrize("suffix", [".pvd", ".vtkhdf"])
+def test_lengths_of_an_answer_stay_in_its_unit(tmp_path, suffix):
+    """In millimetres, if its positions are. A file names no unit of length, so it names no metre."""
+    metres = plate(3)
+    scene = replace(metres.scene, rest_position=1000 * metres.scene.rest_position)
+    info = replace(toy.info(), length_unit="mm")
+    position = 1000 * metres.position
+    answer = Answer("plate", scene, position, metres.stress, 1, [0.1], None, info, {}, "node", (0, 1, 2))
+    answer.save(tmp_path / f"a{suffix}")
+    moved = metres.position - metres.scene.rest_position
+    for frame, mesh in enumerate(read(tmp_path / f"a{suffix}")[1]):
+        same(mesh.points, position[frame])
+        same(mesh.point_data["displacement"], answer.displacement[frame])
+        np.testing.assert_allclose(mesh.point_data["displacement"], 1000 * moved[frame], atol=1e-4)
+        same(answer.to_pyvista(frame).point_data["displacement"], answer.displacement[frame])
+        assert set(mesh.point_data.keys()) == {"displacement", "von_mises", "node_type", "body"}
+    assert np.abs(moved).max() > 0.03
+    files = [file for file in tmp_path.rglob("*") if file.is_file()]
+    assert files and not any(b"[m]" in file.read_bytes() for file in files)
 
 
 @pytest.mark.parametrize("suffix", [".pvd", ".vtkhdf"])
