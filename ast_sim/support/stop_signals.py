@@ -1,4 +1,4 @@
-"""Ctrl-C and other signals that ask a long computation to stop."""
+"""Ctrl-C and other signals that stop a long computation."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, Self
 
 
 class Interrupted(KeyboardInterrupt):
-    """A long computation was asked to stop by a signal, and has kept what it had.
+    """A signal has stopped a long computation, which has kept what it had.
 
     Attributes:
         number: of the signal; SIGPIPE where nobody reads the output.

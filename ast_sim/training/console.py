@@ -59,8 +59,8 @@ def _heard(method: Callable[..., None]) -> Callable[..., None]:
 
 class Console(Progress):
     """The progress of a training; where there is no bar, lines with the losses take its place. If nobody reads the
-    output any more (a closed pipe, a lost terminal) once the steps have begun, the training is asked to stop as by the
-    signal SIGPIPE."""
+    output any more (a closed pipe, a lost terminal) once the steps have begun, the training stops as after the signal
+    SIGPIPE."""
 
     bar_format = "{percentage:3.0f} % |{bar:24}| {n_fmt}/{total_fmt} {unit}{postfix}"
 

@@ -188,7 +188,7 @@ _INTRODUCTION = """# Extremes
 
 Made by `python -m benchmarks.robustness.extremes` from `benchmarks/results/extremes.json`; do not edit.
 
-The run of plates that comes with the package is asked for the last frame of plates that are unlike its training, on an
+The run of plates that comes with the package predicts the last frame of plates that are unlike its training, on an
 {processor}. "Answered" is an answer without a word, "warned" an answer with a warning, "failed" an
 answer that ends early and says why, "refused" a question that is not answered, "error" a fault of ours. The
 error is relative to the displacement, where the right answer is known: from the solver, or from the plate as it is,

@@ -1,7 +1,7 @@
 """Own assemblies: errors of displacement and reaction, the time of an answer, and after how many questions it pays.
 
 `python -m benchmarks.studies.assembly [ROW ...]` generates the scenes of each product of `examples`, trains a run and
-measures it on test scenes, which no training has seen: the deepest frame asked for alone, and all frames together. It
+measures it on test scenes, which no training has seen: the deepest frame alone, and all frames together. It
 writes benchmarks/results/assembly.json and the page of this name in docs/results. Data and runs lie in `--folder`; a
 second call goes on with what is there. Everything runs on one thread.
 """
@@ -147,7 +147,7 @@ def measured(name: str, folder: Path) -> dict[str, Any]:
 
 
 def _curve(run: ast_sim.Run, dataset: ast_sim.Dataset, index: int) -> dict[str, float]:
-    """A test scene, all frames of which are asked for together: the relative error at the deepest frame, the seconds;
+    """A test scene, all frames of which are predicted together: the relative error at the deepest frame, the seconds;
     the reaction in newton in the last frame, the true one, and the one of the last frame alone."""
     truth = dataset.load("test", index)
     began = time.perf_counter()
@@ -219,21 +219,21 @@ _INTRODUCTION = """# Own assemblies
 
 Made by `python -m benchmarks.studies.assembly` from `benchmarks/results/assembly.json`; do not edit.
 
-Each product of `examples` was generated, trained and asked for frames of test scenes, on one thread. "Error" is the
-error of the displacement on the free nodes at the deepest frame, relative to the displacement (mean and standard
-error); "one call" is the error of the network alone. "Reaction" is the error of the force that moves the tool, in the
-last frame. "Largest stress" is the error of the largest von Mises stress. The solver goes to the same frame at its own
-stop test: straight in one, two or four load steps and frame by frame, whichever is fastest. "Fastest setting" is the
-fastest of {settings} whose error is at most the answer's: looser stop tests, coarser meshes, and the same Newton steps
-without a model. All times count what is prepared for a mesh. An answer's time is the median over the test scenes; the
-solver's are medians over the scenes where it was run. "Pays after" is the number of questions whose answers save as
-much time as the simulations and the training took.
+For each product of `examples`, scenes were generated, a run was trained on them, and it predicted frames of test
+scenes, on one thread. "Error" is the error of the displacement on the free nodes at the deepest frame, relative to the
+displacement (mean and standard error); "one call" is the error of the network alone. "Reaction" is the error of the
+force that moves the tool, in the last frame. "Largest stress" is the error of the largest von Mises stress. The solver
+goes to the same frame at its own stop test: straight in one, two or four load steps and frame by frame, whichever is
+fastest. "Fastest setting" is the fastest of {settings} whose error is at most the answer's: looser stop tests, coarser
+meshes, and the same Newton steps without a model. All times count what is prepared for a mesh. An answer's time is the
+median over the test scenes; the solver's are medians over the scenes where it was run. "Pays after" is the number of
+questions whose answers save as much time as the simulations and the training took.
 """
 
 _TOGETHER = """
 ## All frames of a scene at once
 
-With friction, a frame depends on the frames before. If all are asked for, Newton steps know the slip from each frame to
+With friction, a frame depends on the frames before. If all are predicted, Newton steps know the slip from each frame to
 the next, and find the place of equilibrium to which the load path leads. So forces over the travel are more accurate
 than the same frame alone. "Error" and "reaction" are of the same frames as above. The solver finds one frame after the
 other.

@@ -34,7 +34,7 @@ CalculiX found on the same mesh, in scenes that no training has seen. The run pr
 the frames after the turn from its own answer for the turn
 ([the load path](../reference/model.md#jumps-and-corrections)). The Gaussian process (scikit-learn, a squared
 exponential with a length for each parameter) maps the drawn parameters to both numbers; it knows nothing else of a
-scene, and can be asked for nothing else. Times are processor times of one thread ({processor}), beside other work.
+scene, and can predict nothing else. Times are processor times of one thread ({processor}), beside other work.
 """
 
 _VARIANTS = """

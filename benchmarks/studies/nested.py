@@ -136,7 +136,7 @@ two or three Newton steps with linearised contact correct them there. It needs a
 family or a specification has one. A mesh from a file has none, so there the solver has only its other settings.
 
 Each scene is solved to its deepest frame in {both} settings. In each scene the fastest counts whose error is at most
-the error asked for; who does not know the truth cannot choose so well. Without nested iteration there are {plain}
+the wanted error; who does not know the truth cannot choose so well. Without nested iteration there are {plain}
 settings: stop tests, ranges of contact, coarser meshes, 6, 12 and 24 linearised steps. The error compares the
 positions of the free nodes with the frame of the dataset, as a share of their displacement. Times are medians over the
 scenes of processor time on one thread, on a shared machine ({processor}); where scenes were measured several times, the

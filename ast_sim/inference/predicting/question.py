@@ -1,4 +1,4 @@
-"""What is asked of a model: a scene, the motion of its prescribed nodes, and the frames that are wanted."""
+"""What a model is to predict: a scene, the motion of its prescribed nodes, and the frames that are wanted."""
 
 from __future__ import annotations
 
