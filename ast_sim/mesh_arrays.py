@@ -35,6 +35,11 @@ class NodeType(IntEnum):
     HANDLE = 3  # a node of a deforming body with a prescribed position
 
 
+def deforms(node_type: np.ndarray) -> np.ndarray:
+    """[N] bool: the nodes that belong to no obstacle, from the types of the nodes [N]."""
+    return node_type != NodeType.OBSTACLE
+
+
 def scene_arrays(
     name: str,
     points: Any,
@@ -68,7 +73,7 @@ def scene_arrays(
         nodes = _nodes(name, handles, count)
         for doubt in of_obstacles("handles", nodes, types, parts):
             warn(f"{name}: {doubt}")
-        types[nodes[types[nodes] != NodeType.OBSTACLE]] = NodeType.HANDLE
+        types[nodes[deforms(types[nodes])]] = NodeType.HANDLE
     if isinstance(material, Material | Mapping):
         raise ConfigError(
             f"material is {in_short(material)}; it must be numbers, [E, m] or [m], such as (2e5, 0.3): their names"
@@ -82,7 +87,7 @@ def scene_arrays(
 
 def of_obstacles(what: str, nodes: np.ndarray, types: np.ndarray, body: np.ndarray) -> list[str]:
     """One sentence if some of the nodes, which `what` would make handles, are obstacles, which they stay."""
-    rigid = nodes[types[nodes] == NodeType.OBSTACLE]
+    rigid = nodes[~deforms(types[nodes])]
     if not len(rigid):
         return []
     return [

@@ -7,7 +7,7 @@ from itertools import combinations
 import numpy as np
 
 from ast_sim.element_topology import flat_elements
-from ast_sim.mesh_arrays import NodeType
+from ast_sim.mesh_arrays import NodeType, deforms
 from ast_sim.support.errors import DatasetError
 
 
@@ -28,10 +28,10 @@ def require_deforming(name: str, position: np.ndarray, elements: np.ndarray, nod
     """What `Scene.require_predictable` does."""
     if (node_type != NodeType.NORMAL).all():
         raise DatasetError(f"{name}: all nodes are obstacles or handles, so nothing deforms: leave this scene out")
-    deforming = node_type != NodeType.OBSTACLE
+    deforming = deforms(node_type)
     if (position[deforming] == position[deforming][0]).all():
         raise DatasetError(f"{name}: all nodes that deform lie at one point at rest: give them their positions")
-    require_extent(name, position, elements, deforming[elements].any(axis=1))
+    require_extent(name, position, elements, np.any(deforming[elements], axis=1))
 
 
 def require_mesh(name: str, elements: np.ndarray, node_type: np.ndarray, body: np.ndarray) -> None:

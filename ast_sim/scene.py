@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ast_sim.element_topology import LOCAL_EDGES, signed_volumes, surface_triangles, unique_edges
-from ast_sim.mesh_arrays import NodeType, arrays_of_mesh, joined_arrays, mesh_of_arrays, scene_arrays
+from ast_sim.mesh_arrays import NodeType, arrays_of_mesh, deforms, joined_arrays, mesh_of_arrays, scene_arrays
 from ast_sim.mesh_rules import require_deforming, require_mesh
 from ast_sim.named_field import NamedField
 from ast_sim.number_arrays import ascending, ranges, require_array, require_finite, require_nodes, require_numbering
@@ -136,7 +136,7 @@ class Scene(ReadOnlyArrays):
     @property
     def deforming_nodes(self) -> np.ndarray:
         """[N] bool: the nodes that belong to no obstacle. Obstacles are rigid and have no stress."""
-        return self.node_type != NodeType.OBSTACLE
+        return deforms(self.node_type)
 
     @property
     def deforming_elements(self) -> np.ndarray:

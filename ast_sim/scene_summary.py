@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ast_sim.element_topology import surface_triangles, unit_normals
-from ast_sim.mesh_arrays import NodeType
+from ast_sim.mesh_arrays import NodeType, deforms
 from ast_sim.support.errors import counted
 
 MOST_TRIANGLES = 6000  # a drawing of more would be megabytes
@@ -52,7 +52,7 @@ def scene_drawing(position: np.ndarray, elements: np.ndarray, node_type: np.ndar
     pixels = np.round(5 + (flat - low) * scale, 1)
     pixels[:, :, 1] = np.round(10 + scale * (high[1] - low[1]), 1) - pixels[:, :, 1]
     shade = 0.6 + 0.4 * np.abs(normal @ LIGHT)
-    rigid = (node_type[surface] == NodeType.OBSTACLE).any(axis=1)
+    rigid = ~np.all(deforms(node_type)[surface], axis=1)
     lines = []
     for triangle in np.argsort(-(corners.mean(axis=1) @ forward), kind="stable"):
         if facing[triangle]:

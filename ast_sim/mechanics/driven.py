@@ -16,7 +16,7 @@ from functools import cached_property
 import numpy as np
 
 from ast_sim.element_topology import LOCAL_EDGES
-from ast_sim.scene import NodeType, Scene
+from ast_sim.scene import Scene
 from ast_sim.support.notebook_table import one_line
 
 RIGID = 1e-3  # nodes follow a motion if they are no farther off, as a share of the largest displacement
@@ -64,7 +64,7 @@ class Driven:
         farthest = int(np.argmax(travel))
         body = int(scene.body[farthest])
         own, moves = scene.prescribed & (scene.body == body), travel > RIGID * travel[farthest]
-        if scene.node_type[farthest] == NodeType.OBSTACLE or not moves.any():
+        if not scene.deforming_nodes[farthest] or not moves.any():
             nodes = own
         else:
             nodes = _moved_together(_edges_between(scene, own), own, moves, prescribed_position, farthest)

@@ -13,7 +13,7 @@ from ast_sim.importers.formats.vtk_files import vtk_frames
 from ast_sim.importers.solved_jobs.job import Job
 from ast_sim.importers.stress import order_of, von_mises
 from ast_sim.material import PRESSURES
-from ast_sim.scene import NodeType
+from ast_sim.mesh_arrays import deforms
 from ast_sim.support.errors import DatasetError, counted, warn
 
 # The coordinates of a deck and of its results may differ by this share of the size of the mesh; results have 6 digits.
@@ -130,7 +130,7 @@ def _require_whole(job: Job, path: Path, given: dict[str, np.ndarray]) -> None:
         DatasetError: some have none.
     """
     used = _used(job.mesh)
-    deforming = used[job.node_type[used] != NodeType.OBSTACLE]
+    deforming = used[deforms(job.node_type[used])]
     for name, nodes, how in (
         ("displacement", used, "U for all nodes (*NODE FILE without NSET=)"),
         ("von_mises", deforming, "S for all elements (*EL FILE without NSET=)"),
