@@ -128,8 +128,8 @@ def solve_frame(
             position = solver.newton.position
         except SimulationError as error:
             failure = str(error)
-    effort = solver.load_steps, solver.iterations, solver.halvings
-    return OneFrame(position, failure, seconds, began - started, *effort)
+    counts = solver.load_steps, solver.iterations, solver.halvings
+    return OneFrame(position, failure, seconds, began - started, *counts)
 
 
 class SolidFrames(Frames[SolidRecord]):

@@ -40,9 +40,9 @@ class Numbered:
         for block, numbers in enumerate(blocks[self.taken :], self.taken):
             self.places.update(zip(numbers.tolist(), ((block, row) for row in range(len(numbers))), strict=True))
         self.taken = len(blocks)
-        lost = next((number for number in wanted.tolist() if number not in self.places), None)
-        if lost is not None:
-            raise LookupError(f"there is no {what} {lost} before this line")
+        missing = next((number for number in wanted.tolist() if number not in self.places), None)
+        if missing is not None:
+            raise LookupError(f"there is no {what} {missing} before this line")
         return [self.places[number] for number in wanted.tolist()]
 
 

@@ -93,10 +93,10 @@ class NastranPoints:
         if len(texts) == 9:
             rows = [self._moved(other, texts[row : row + 3], place, within) for row in (0, 3, 6)]
         else:
-            lost = next((text for text in texts if text not in self.grids), None)
-            if lost is not None:
+            missing = next((text for text in texts if text not in self.grids), None)
+            if missing is not None:
                 raise DatasetError(
-                    f"{self.path}: the system {system} ({place}) has the GRID {lost}, which there is not"
+                    f"{self.path}: the system {system} ({place}) has the GRID {missing}, which there is not"
                 )
             cards = [self.grids[text] for text in texts]
             rows = [self._moved(other or self.default, own, place, within) for other, own, _ in cards]

@@ -64,12 +64,12 @@ def outcomes_of(task: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     with Dataset(task["dataset"]) as dataset:
         scene = dataset.scene(task["split"], task["index"])
         truth = dataset.frames(task["split"], task["index"], task["frame"], task["frame"] + 1)[0][0].astype(np.float64)
-    walk = tuple(range(1, task["frame"] + 1)) if recipe.keep is None else recipe.keep[: task["frame"]]
+    frames = tuple(range(1, task["frame"] + 1)) if recipe.keep is None else recipe.keep[: task["frame"]]
     started = _seconds()
     drawn = draw_sample(recipe, task["split"], task["index"])
     draw_seconds = _seconds() - started
     _require_same(drawn.case.scene, scene)
-    solver = VariantSolver(drawn, walk, truth, family_module(recipe.family).SETTINGS, task)
+    solver = VariantSolver(drawn, frames, truth, family_module(recipe.family).SETTINGS, task)
     outcomes = [solver.outcome(SolverVariant(**variant)) for variant in task["variants"]]
     facts = {
         "displacement": solver.displacement,
@@ -103,22 +103,22 @@ class VariantSolver:
 
     Args:
         drawn: the scene.
-        walk: the numbers of the dataset's frames in the motion of the scene, up to the one to be solved.
+        frames: the numbers of the dataset's frames in the motion of the scene, up to the one to be solved.
         truth: [N,3] float64, the dataset's positions in this frame.
         settings: the tolerances with which the dataset was made.
-        effort: `starts`, `repeats` and `most_iterations`.
+        limits: `starts`, `repeats` and `most_iterations`.
     """
 
     def __init__(
         self,
         drawn: Drawn,
-        walk: tuple[int, ...],
+        frames: tuple[int, ...],
         truth: np.ndarray,
         settings: SolverSettings,
-        effort: dict[str, Any],
+        limits: dict[str, Any],
     ) -> None:
-        self.drawn, self.walk, self.truth, self.settings, self.effort = drawn, walk, truth, settings, effort
-        self.frame = walk[-1]
+        self.drawn, self.frames, self.truth, self.settings, self.limits = drawn, frames, truth, settings, limits
+        self.frame = frames[-1]
         self.path_counts = drawn.case.friction > 0
         self.free = ~drawn.case.scene.prescribed
         self.rest = drawn.case.scene.rest_position.astype(np.float64)
@@ -214,18 +214,18 @@ class VariantSolver:
 
     def _best(self, solve: Callable[[], OneFrame]) -> OneFrame:
         """The fastest of all repeats."""
-        return min((solve() for _ in range(self.effort["repeats"])), key=lambda one: one.setup_seconds + one.seconds)
+        return min((solve() for _ in range(self.limits["repeats"])), key=lambda one: one.setup_seconds + one.seconds)
 
     def _fastest(self, case: SolidCase, settings: SolverSettings) -> tuple[int, OneFrame]:
         """The start with the fastest solution, and the solution; without any, the start that failed fastest."""
         best: tuple[int, OneFrame] | None = None
-        for start in self.effort["starts"]:
-            for _ in range(self.effort["repeats"]):
+        for start in self.limits["starts"]:
+            for _ in range(self.limits["repeats"]):
                 # Whoever takes longer than the best so far cannot be the fastest.
                 most = best[1].seconds if best is not None and not best[1].failure else np.inf
                 first = 1 / start if start else 0.0
                 solved = solve_frame(
-                    case, self.frame, settings, first, self.effort["most_iterations"], most_seconds=most
+                    case, self.frame, settings, first, self.limits["most_iterations"], most_seconds=most
                 )
                 if best is None or (bool(solved.failure), solved.seconds) < (bool(best[1].failure), best[1].seconds):
                     best = start, solved
@@ -234,8 +234,8 @@ class VariantSolver:
 
     def _every_frame(self, case: SolidCase, settings: SolverSettings) -> OneFrame:
         """From each frame of the dataset to the next."""
-        most = self.effort["most_iterations"]
-        return solve_frame(case.keeping(self.walk), len(self.walk), settings, first=0, most_iterations=most)
+        most = self.limits["most_iterations"]
+        return solve_frame(case.keeping(self.frames), len(self.frames), settings, first=0, most_iterations=most)
 
     def _linearised(self, case: SolidCase, steps: int) -> OneFrame:
         """`steps` load steps of one Newton step with linearised contact, and one Newton step more."""
