@@ -105,7 +105,9 @@ class TrainingPool(ABC, Generic[S]):
         for place, scene in self._going.items():
             for key in self.kept:
                 value = state.get(f"{place}.{key}")
-                setattr(scene, key, None if value is None else value.numpy() if value.dim() else value.item())
+                if value is not None:
+                    value = value.numpy() if value.dim() else value.item()
+                setattr(scene, key, value)
 
     def _places(self, number: int) -> range:
         """The places in the pool of this part of a batch."""

@@ -51,7 +51,8 @@ def convert(source: Path | str, out: Path | str, **options: Any) -> dict[str, in
         ConfigError: there is no such option for this source.
         DatasetError: a file is wrong or something is missing in it; the text names the file. Nothing is written then.
     """
-    if not (source := file_name(source, "source")).exists():
+    source = file_name(source, "source")
+    if not source.exists():
         raise DatasetError(f"{source}: there is no such file or folder")
     require_bool(**{key: options[key] for key in ("corners", "incomplete", "strict") if key in options})
     read = convert_deepmind if is_deepmind(source) else convert_series

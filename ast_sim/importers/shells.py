@@ -133,7 +133,9 @@ def _looks_out(points: np.ndarray, triangles: np.ndarray, tetrahedra: np.ndarray
     inside = np.abs(igl.winding_number(np.ascontiguousarray(points[used]), faces, one_of_each)) > 0.5
     a, b, c = np.moveaxis(points[triangles] - points[triangles[0, 0]], 1, 0)
     outwards = 1 if np.einsum("ij,ij->", a, np.cross(b, c)) > 0 else -1
-    return 0 if inside.any() != inside.all() else (-outwards if inside.all() else outwards)
+    if inside.any() != inside.all():
+        return 0
+    return -outwards if inside.all() else outwards
 
 
 def _fitting(

@@ -199,8 +199,9 @@ def stress_place(
         DatasetError: there is no field of this name, or it is none of a whole stress; the text names what there is.
     """
     name = stress or "von_mises"
-    place = "node" if name in frame.point_fields else "element" if name in frame.cell_fields else "none"
-    if place == "none":
+    on_points = name in frame.point_fields
+    on_cells = name in frame.cell_fields
+    if not on_points and not on_cells:
         if stress is not None:
             known = sorted({*frame.point_fields, *frame.cell_fields})
             stems = " or ".join(map(repr, stems_of(known)))
@@ -208,16 +209,18 @@ def stress_place(
             listed = ", ".join(known) or "none"
             told = f"there is no field {stress!r}; there are: {listed}{parts if stems else ''}"
             raise DatasetError(f"{frame.path}: {told}")
-        return place, (), []
+        return "none", (), []
     whole = stem_of(name, [*frame.point_fields, *frame.cell_fields])
     if whole:
         raise DatasetError(f"{frame.path}: {name!r} is one component of a stress: name what all have, {whole!r}")
-    values = raw_field(frame, "point" if place == "node" else "cell", name)
+    values = raw_field(frame, "point" if on_points else "cell", name)
     order = order_of(frame.path, name, values, frame.columns.get(name, ()), given)
-    both = name in frame.point_fields and name in frame.cell_fields
-    notes = [f"{name!r} is a field of points and one of cells: the one of points is taken"] if both else []
-    computed = f"the von Mises stress is computed from the components {', '.join(order)} of {name!r}"
-    return place, order, [*notes, computed] if order else notes
+    notes: list[str] = []
+    if on_points and on_cells:
+        notes.append(f"{name!r} is a field of points and one of cells: the one of points is taken")
+    if order:
+        notes.append(f"the von Mises stress is computed from the components {', '.join(order)} of {name!r}")
+    return "node" if on_points else "element", order, notes
 
 
 def von_mises(values: np.ndarray, order: tuple[str, ...]) -> np.ndarray:

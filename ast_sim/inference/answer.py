@@ -112,6 +112,7 @@ class Answer:
     def _facts(self) -> dict[str, str]:
         unit = "" if self.info is None else f" {self.info.length_unit}"
         moved = np.linalg.norm(self.displacement[:, self.scene.deforming_nodes], axis=2)
+        band = self.band()
         return {
             "name": self.name,
             "frames": ", ".join(map(str, self.frames[:10])) + (", ..." if len(self.frames) > 10 else ""),
@@ -120,7 +121,7 @@ class Answer:
             "largest stress": "none" if self.stress is None else f"{self.stress.max(initial=0.0):.4g} Pa",
             "expected error": "not known" if self.expected_error is None else percent(self.expected_error),
             "converged": {None: "no Newton steps", True: "yes", False: "no"}[self.converged],
-            **({} if (band := self.band()) is None else {f"band ({100 * LEVEL:g} %)": f"{band.max():.3g}{unit}"}),
+            **({} if band is None else {f"band ({100 * LEVEL:g} %)": f"{band.max():.3g}{unit}"}),
             "seconds": f"{self.seconds:.3g}",
             **({} if self.failure is None else {"failure": self.failure}),
         }

@@ -133,7 +133,8 @@ def _measured(run: Run, dataset: Dataset, split: str, progress: ShowProgress) ->
     spacings = [one.spacing for one in scenes]
     latents = [one.latents for one in scenes if one.latents is not None]
     familiarity = Familiarity.of(latents) if len(latents) >= FEWEST else None
-    kept = _kept_errors(to_choose, [list(of_effort) for of_effort in zip(*(one.errors for one in scenes), strict=True)])
+    errors_of_efforts = [list(errors) for errors in zip(*(one.errors for one in scenes), strict=True)]
+    kept = _kept_errors(to_choose, errors_of_efforts)
     reach = (min(spacings), max(spacings))
     return Calibration(len(scenes), efforts, quantiles, typical, reach, kept, familiarity), left_out
 

@@ -144,7 +144,8 @@ class Simulator(nn.Module):
     def pairs(self, dataset: Dataset, split: str = "train", *, batch_size: int = 1, **options: Any) -> PairSampler:
         """The frame pairs of a split in batches that fit this model, for a DataLoader of torch or by number:
 
-        loader = DataLoader(pairs := model.pairs(dataset), batch_size=4, shuffle=True, collate_fn=pairs.collate)
+        pairs = model.pairs(dataset)
+        loader = DataLoader(pairs, batch_size=4, shuffle=True, collate_fn=pairs.collate)
         batch, target = model.pairs(dataset, batch_size=4).batch(step)
 
         Args:

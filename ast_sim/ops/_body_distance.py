@@ -20,7 +20,8 @@ WIDTH = 5
 
 
 def _check_finite(name: str, sizes: Sizes, given: Given) -> None:
-    radius, ahead = given["radius"], given["position"].double() + given["motion"].double()
+    radius = given["radius"]
+    ahead = given["position"].double() + given["motion"].double()
     if not 0 < radius < float("inf"):
         raise ValueError(f"{name}: radius must be positive and finite, not {radius}")
     bad = (~ahead.isfinite().all(1)).nonzero()

@@ -48,8 +48,11 @@ def _linear_reference(x, weight, bias, residual, activation, save):
         out = a * F.gelu(b)
     elif activation == RELU:
         out = F.relu(z)
-    out = out if residual is None else out + residual
-    return out, (z.clone() if out is z else z) if save else None
+    if residual is not None:
+        out = out + residual
+    if not save:
+        return out, None
+    return out, z.clone() if out is z else z
 
 
 def _known_z(given: dict):

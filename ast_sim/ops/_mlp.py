@@ -54,11 +54,14 @@ def layer_norm(y: Tensor, gamma: Tensor, beta: Tensor) -> Tensor:
 
 def _reference(x, beside, weight1, bias1, weight2, bias2, gamma, beta, residual, save):
     hidden = F.relu(F.linear(x if beside is None else torch.cat([x, beside], dim=1), weight1, bias1))
-    y = out = F.linear(hidden, weight2, bias2)
-    if gamma is not None:
-        out = layer_norm(y, gamma, beta)
-    kept = (hidden, *(normalize(y) if gamma is not None else (None, None))) if save else (None, None, None)
-    return out if residual is None else out + residual, *kept
+    product = F.linear(hidden, weight2, bias2)
+    out = product if gamma is None else layer_norm(product, gamma, beta)
+    if residual is not None:
+        out = out + residual
+    if not save:
+        return out, None, None, None
+    normalized, scale = (None, None) if gamma is None else normalize(product)
+    return out, hidden, normalized, scale
 
 
 _mlp = Op(Kernel("mlp", _SPEC), _reference)

@@ -138,7 +138,8 @@ def _check_domain(name: str, sizes: Sizes, given: Given) -> None:
     if not all(abs(x) < 1e300 for x in center):
         raise ValueError(f"{name}: center must be finite")
     unit = _unit(positions, center, half_width)
-    finite, inside = positions.isfinite().all(1), ((unit >= -1e-6) & (unit <= 1 + 1e-6)).all(1)
+    finite = positions.isfinite().all(1)
+    inside = ((unit >= -1e-6) & (unit <= 1 + 1e-6)).all(1)
     bad = (~(finite & inside)).nonzero()
     if len(bad):
         node = int(bad[0])

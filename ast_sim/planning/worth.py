@@ -17,6 +17,7 @@ from ast_sim.inference.effort import Effort
 from ast_sim.inference.trained_run import Run
 from ast_sim.number_arrays import measured_time
 from ast_sim.planning.trials import MINUTES, TIMED, Trials, trial_folder
+from ast_sim.scene import Trajectory
 from ast_sim.simulate.jobs.generate import checked_workers, generate
 from ast_sim.simulate.own_assembly.spec_reader import read_spec
 from ast_sim.support.argument_checks import require_type
@@ -100,7 +101,8 @@ def worth(
     require_type("minutes", minutes, Real, "a number")
     require_range("minutes", minutes, *MINUTES)
     read_spec(spec)  # a mistake in it leaves no folder
-    make_folder(folder := trial_folder(out))
+    folder = trial_folder(out)
+    make_folder(folder)
     made = generate(
         "assembly", folder / "scenes.h5", train=SOLVED - 1, valid=1, test=0, nodes=nodes, frames=frames, solver=solver,
         spec=spec, progress=progress,
@@ -111,14 +113,6 @@ def worth(
         answered = statistics.median(dataset.num_frames("train", index) for index in range(SOLVED - 1)) - 1
         truth = dataset["valid"][0]
     trial = Trials(folder, SOLVED - 1, 1).trained("tiny", config, TIMED)
-    run = Run(folder / trial.run)
-    seconds = []
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # its weights are of no use; only its time counts
-        for _ in range(1 + TIMED_ANSWERS):
-            began = time.process_time()
-            run.predict(truth, effort=Effort(), throw=False, progress=False)
-            seconds.append(time.process_time() - began)
     steps = int(60 * minutes / trial.seconds)
     options = {"--nodes": nodes, "--frames": frames, "--solver": solver}
     given = [text for key, value in options.items() if value is not None for text in (key, str(value))]
@@ -132,7 +126,19 @@ def worth(
         scenes=scenes,
         workers=checked_workers(None, None),
         solve_seconds=statistics.median(scene_seconds),
-        answer_seconds=statistics.median(seconds[1:]),
+        answer_seconds=_answer_seconds(Run(folder / trial.run), truth),
         step_seconds=trial.seconds,
         command=shlex.join(making),
     )
+
+
+def _answer_seconds(run: Run, truth: Trajectory) -> float:
+    """The median processor time of an answer after one call, without the first one, in which much is prepared."""
+    seconds = []
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # its weights are of no use; only its time counts
+        for _ in range(1 + TIMED_ANSWERS):
+            began = time.process_time()
+            run.predict(truth, effort=Effort(), throw=False, progress=False)
+            seconds.append(time.process_time() - began)
+    return statistics.median(seconds[1:])

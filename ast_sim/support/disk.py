@@ -103,7 +103,10 @@ def _remove_leftovers(folder: Path) -> None:
         for entry in os.scandir(folder):
             match = _LEFTOVER.fullmatch(entry.name)
             if match and not _runs(int(match[1])) and time.time() - entry.stat().st_mtime > _LEFTOVER_AGE:
-                shutil.rmtree(entry.path) if entry.is_dir() else os.unlink(entry.path)
+                if entry.is_dir():
+                    shutil.rmtree(entry.path)
+                else:
+                    os.unlink(entry.path)
 
 
 def _runs(process: int) -> bool:

@@ -50,9 +50,9 @@ class TensorBoard:
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
         _, board = require("tensorboard", "tensorboard", "torch.utils.tensorboard")
-        make_folder(path := file_name(folder, "folder"))
-        self.folder = path
-        self._writer = board.SummaryWriter(str(path))
+        self.folder = file_name(folder, "folder")
+        make_folder(self.folder)
+        self._writer = board.SummaryWriter(str(self.folder))
 
     def __repr__(self) -> str:
         return one_line("TensorBoard", {"folder": self.folder})

@@ -108,15 +108,18 @@ def _predicted(
     for question in questions:
         question.check(model.config.data.given_frames)
     # Several questions may share a scene.
-    graph, carrier, solver = cache(model.graph), cache(Carrier), cache(law_of(model.config).newton_steps)
+    graph = cache(model.graph)
+    carrier = cache(Carrier)
+    solver = cache(law_of(model.config).newton_steps)
     with model.predicting():
         scenes = [JumpingScene(model, q, graph(q.scene), carrier(q.scene), solver) for q in questions]
         frames = [frame for scene in scenes for frame in scene.frames]
         with Progress(len(frames), "frames", progress) as bar:
-            for group in (group for wave in _waves(scenes) for group in _groups(model, wave)):
-                _predict(model, group, effort)
-                if not effort.newton_steps and not effort.solved:
-                    bar.advance(group[-1].name, len(group))
+            for wave in _waves(scenes):
+                for group in _groups(model, wave):
+                    _predict(model, group, effort)
+                    if not effort.newton_steps and not effort.solved:
+                        bar.advance(group[-1].name, len(group))
             # In ascending order, whatever the domains: with friction a frame needs to know the one before.
             for frame in frames if effort.newton_steps else ():
                 frame.refine(effort.newton_steps, each_step, bar)

@@ -78,7 +78,8 @@ def errors_of(answer: Answer, truth: Trajectory) -> dict[str, float]:
         if not _rounds_to_zero(np.linalg.norm(forces, axis=1), frame):
             errors["reaction"] = relative_distance(ours, forces[frame])
     if answer.stress is not None and truth.stress is not None:
-        rows = truth.scene.deforming(location := answer.stress_location or "node")
+        location = answer.stress_location or "node"
+        rows = truth.scene.deforming(location)
         _, largest = stress_errors(truth, answer.stress[row], frame, location)
         if largest is not None and not _rounds_to_zero(truth.stress[:, rows].max(axis=(1, 2), initial=0.0), frame):
             errors["stress"] = largest

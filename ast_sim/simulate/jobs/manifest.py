@@ -57,11 +57,10 @@ class Manifest:
         self._file.close()
 
     def _facts(self, sample: Sample) -> dict[str, Any]:
-        with open(sample_path(self.folder, *sample), "rb") as file:
-            return {
-                "bytes": file.seek(0, 2),
-                "sha256": (file.seek(0), hashlib.file_digest(file, "sha256").hexdigest())[1],
-            }
+        path = sample_path(self.folder, *sample)
+        with open(path, "rb") as file:
+            sha256 = hashlib.file_digest(file, "sha256").hexdigest()
+        return {"bytes": path.stat().st_size, "sha256": sha256}
 
     def _last_states(self) -> dict[str, dict[str, Any]]:
         """The last line of each sample. Lines that cannot be read, such as one cut short by a crash, are left out."""

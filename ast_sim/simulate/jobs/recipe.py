@@ -87,11 +87,14 @@ def checked_recipe(
     if patient and solver != "own":
         raise ConfigError(f"patient is for the own solver; {solver} has limits of its own")
     if parts is not None:
-        _source(parts := file_name(parts, "parts"))
+        parts = file_name(parts, "parts")
+        _source(parts)
     keep = None if keep is None else _checked_keep(keep, (frames or module.FRAMES) - 1)
-    parts = None if parts is None else str(Path(parts).resolve())
-    spec = None if spec is None else str(Path(spec).resolve())
-    return Recipe(family, seed, nodes, frames, solver, parts, spec, patient, keep, order)
+    return Recipe(family, seed, nodes, frames, solver, _resolved(parts), _resolved(spec), patient, keep, order)
+
+
+def _resolved(file: str | os.PathLike[str] | None) -> str | None:
+    return None if file is None else str(Path(file).resolve())
 
 
 def recipe_of(name: str, info: DatasetInfo, made_from: str | os.PathLike[str] | None = None) -> Recipe:

@@ -192,5 +192,6 @@ def values_of(attributes: Mapping[str, Any]) -> Values:
 
 def told(parameters: Mapping[str, Parameter], values: Values) -> str:
     """The drawn values as a text for messages."""
-    shown = [name for name, one in parameters.items() if one.is_drawn]
-    return ", ".join(f"{n}={v:.4g}" if isinstance(v := values[n], float) else f"{n}={v}" for n in shown) or "its values"
+    shown = {name: values[name] for name, one in parameters.items() if one.is_drawn}
+    texts = {name: f"{value:.4g}" if isinstance(value, float) else value for name, value in shown.items()}
+    return ", ".join(f"{name}={text}" for name, text in texts.items()) or "its values"

@@ -147,7 +147,8 @@ def case(spec: AssemblySpec, values: Values, frames: int, parts: list[PlacedPart
     attributes: dict[str, AttributeValue] = {**recorded(values), "origin": list(shared.origin)}
     notes = dict.fromkeys([*(note for part in parts for note in part.notes), *touching, *_soft(spec, values)])
     attributes |= {NOTES: NEXT_NOTE.join(notes)} if notes else {}
-    hardening = {number: table for number, part in enumerate(spec.parts) if len(table := hardening_of(part, values))}
+    tables = [hardening_of(part, values) for part in spec.parts]
+    hardening = {number: table for number, table in enumerate(tables) if len(table)}
     return SolidCase(scene, course.position, NeoHookean(*law), contact, "node", attributes, course, hardening)
 
 
