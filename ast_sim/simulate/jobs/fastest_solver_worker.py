@@ -117,7 +117,11 @@ class VariantSolver:
         settings: SolverSettings,
         effort: dict[str, Any],
     ) -> None:
-        self.drawn, self.walk, self.truth, self.settings, self.effort = drawn, walk, truth, settings, effort
+        self.drawn = drawn
+        self.walk = walk
+        self.truth = truth
+        self.settings = settings
+        self.effort = effort
         self.frame = walk[-1]
         self.path_counts = drawn.case.friction > 0
         self.free = ~drawn.case.scene.prescribed
