@@ -256,7 +256,7 @@ def test_names_without_nouns_are_seen():
     assert not without_nouns("'found'\nx.found\nfound_at = 1")
 
 
-@pytest.mark.parametrize("path", MODULE_FILES, ids=lambda path: path.relative_to(REPOSITORY).as_posix())
+@pytest.mark.parametrize("path", [*MODULE_FILES, *BENCHMARKS], ids=lambda path: path.relative_to(REPOSITORY).as_posix())
 def test_names_are_nouns(path):
     """In the package and in the benchmarks; tests may call what they find so."""
     assert not without_nouns(path.read_text(encoding="utf-8")), f"a noun in place of {NO_NOUNS}"
