@@ -68,7 +68,8 @@ def _slopes(weights: np.ndarray) -> np.ndarray:
     by_corner = np.zeros((len(weights), 10, 4))
     by_corner[:, range(4), range(4)] = 4 * weights - 1
     for node, (a, b) in enumerate(MIDDLES, 4):
-        by_corner[:, node, a], by_corner[:, node, b] = 4 * weights[:, b], 4 * weights[:, a]
+        by_corner[:, node, a] = 4 * weights[:, b]
+        by_corner[:, node, b] = 4 * weights[:, a]
     return by_corner[:, :, 1:] - by_corner[:, :, :1]
 
 
@@ -151,7 +152,9 @@ def signed_volumes(points: np.ndarray, elements: np.ndarray) -> np.ndarray:
     for first in range(0, len(elements), _BLOCK):
         nodes = np.ascontiguousarray(elements[first : first + _BLOCK, :4].T)
         x, y, z = (np.take(axis, nodes) for axis in coordinates)
-        (ax, bx, cx), (ay, by, cy), (az, bz, cz) = x[1:] - x[0], y[1:] - y[0], z[1:] - z[0]
+        ax, bx, cx = x[1:] - x[0]
+        ay, by, cy = y[1:] - y[0]
+        az, bz, cz = z[1:] - z[0]
         six = ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx)
         volumes[first : first + _BLOCK] = six / 6
     return volumes

@@ -167,7 +167,8 @@ class Scene(ReadOnlyArrays):
         """
         require_array(name, "rest_position", self.rest_position, np.float32, (None, 3))
         require_array(name, "elements", self.elements, np.int32, (None, None))
-        n, (e, k) = self.num_nodes, self.elements.shape
+        n = self.num_nodes
+        e, k = self.elements.shape
         require_array(name, "node_type", self.node_type, np.uint8, (n,))
         require_array(name, "body", self.body, np.int32, (n,))
         if self.material is not None:
@@ -302,10 +303,10 @@ class Trajectory:
         """
         if self.stress is None:
             return "none"
-        n, e = self.scene.num_nodes, self.scene.num_elements
-        if self.stress_location is None and n == e:
+        n = self.scene.num_nodes
+        if self.stress_location is None and n == self.scene.num_elements:
             raise DatasetError(
-                f"the stress may be at the {n} nodes or in the {e} elements: give the trajectory its stress_location"
+                f"the stress may be at the {n} nodes or in the {n} elements: give the trajectory its stress_location"
             )
         return self.stress_location or ("node" if self.stress.shape[1] == n else "element")
 
@@ -318,7 +319,8 @@ class Trajectory:
         require_type(f"{name}: its scene", self.scene, Scene, "a Scene")
         require_type(f"{name}: its fields", self.fields, Mapping, "fields by name")
         self.scene.check(name)
-        n, e = self.scene.num_nodes, self.scene.num_elements
+        n = self.scene.num_nodes
+        e = self.scene.num_elements
         require_array(name, "position", self.position, np.float32, (None, n, 3))
         if self.num_frames == 0:
             raise DatasetError(f"{name}: a trajectory needs at least one frame")
@@ -335,15 +337,13 @@ class Trajectory:
             require_finite(name, "cauchy_stress", "element", self.cauchy_stress)
         if self.stress is None:
             return
-        location = stress_location or self.stress_location
-        if location not in (None, "node", "element"):
-            raise DatasetError(f"{name}: stress_location is {location!r}; it must be 'node' or 'element'")
-        if self.stress_location not in (None, location):
-            raise DatasetError(
-                f"{name}: has stress at each {self.stress_location}, but stress_location is {location!r}"
-            )
+        wanted = stress_location or self.stress_location
+        if wanted not in (None, "node", "element"):
+            raise DatasetError(f"{name}: stress_location is {wanted!r}; it must be 'node' or 'element'")
+        if self.stress_location not in (None, wanted):
+            raise DatasetError(f"{name}: has stress at each {self.stress_location}, but stress_location is {wanted!r}")
         require_array(name, "stress", self.stress, np.float32, (self.num_frames, None, 1))
-        rows = {"node": (n,), "element": (e,), None: (n, e)}[location]
+        rows = {"node": (n,), "element": (e,), None: (n, e)}[wanted]
         if self.stress.shape[1] not in rows:
             raise DatasetError(f"{name}: stress has {self.stress.shape[1]} rows; needs {' or '.join(map(str, rows))}")
-        require_finite(name, "stress", location or "row", self.stress)
+        require_finite(name, "stress", wanted or "row", self.stress)

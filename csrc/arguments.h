@@ -20,7 +20,7 @@ static ast_kernels bfloat16_kernels;       /* the same, but for products in bflo
 static _Thread_local bool bfloat16_products; /* whether this thread wants them */
 static bool debug;                           /* AST_SIM_DEBUG=1 */
 
-static const ast_kernels *chosen_kernels(void) { return bfloat16_products ? &bfloat16_kernels : float32_kernels; }
+static const ast_kernels *call_table(void) { return bfloat16_products ? &bfloat16_kernels : float32_kernels; }
 
 typedef struct {
   void *data;                 /* NULL where None was given */
@@ -28,7 +28,7 @@ typedef struct {
   int64_t integer;            /* also a number's 64 bits */
   double number;
   int64_t bytes, row_bytes; /* of all elements, and from row to row */
-  bool dense;
+  bool contiguous;
   frozen *frozen; /* whose private copy `data` is, or where an output is made; held during the call; or NULL */
   void *secured;  /* or a copy made for this call */
   void *copy;     /* debug: what an input held before the call */
@@ -48,7 +48,7 @@ static bool call_fail(const call *c, const char *problem) {
 }
 
 /* The name of an argument; good until the next call. */
-static const char *name_of(const call *c, int i) {
+static const char *call_name_of(const call *c, int i) {
   static char shown[80];
   const char *name = c->spec->names;
   while (i--) name = strchr(name, ' ') + 1;
@@ -57,13 +57,13 @@ static const char *name_of(const call *c, int i) {
 }
 
 static bool call_refuse(const call *c, int i, PyObject *type, const char *why) {
-  PyErr_Format(type, "%s: %s %s", c->spec->name, name_of(c, i), why);
+  PyErr_Format(type, "%s: %s %s", c->spec->name, call_name_of(c, i), why);
   return false;
 }
 
 /* ---- dimensions ---- */
 
-static int64_t value_of(const call *c, const dimension *d) {
+static int64_t call_value_of(const call *c, const dimension *d) {
   int64_t value = d->constant;
   for (int i = 0; i < 2; i++) {
     const int64_t size = c->size[d->letter[i]];
@@ -74,33 +74,33 @@ static int64_t value_of(const call *c, const dimension *d) {
 
 /* Whether an axis may be as long as this. A letter that stands alone binds at first sight; in a sum an absent one is
  * 0. */
-static bool fits(call *c, const dimension *d, int64_t length) {
+static bool call_fits(call *c, const dimension *d, int64_t length) {
   int64_t *size = &c->size[d->letter[0]];
   if (*size == UNBOUND && !d->letter[1]) {
     const int64_t rest = length - d->constant;
     if (rest < 0 || rest % d->factor[0]) return false;
     *size = rest / d->factor[0];
   }
-  return length == value_of(c, d);
+  return length == call_value_of(c, d);
 }
 
 /* ---- arrays and numbers ---- */
 
-static bool take_shape(call *c, const parameter *p, const view *v) {
+static bool call_take_shape(call *c, const parameter *p, const view *v) {
   bool right = v->ndim == p->ndim;
-  for (int d = 0; right && d < p->ndim; d++) right = fits(c, &p->shape[d], v->shape[d]);
+  for (int d = 0; right && d < p->ndim; d++) right = call_fits(c, &p->shape[d], v->shape[d]);
   return right;
 }
 
-static bool take_layout(const parameter *p, const view *v, argument *a) {
+static bool argument_take_layout(const parameter *p, const view *v, argument *a) {
   const int64_t size = view_size(v);
   int64_t expected = v->item;
-  a->dense = true;
+  a->contiguous = true;
   for (int d = v->ndim - 1; d >= 0; d--) {
     const int64_t stride = v->stride[d];
     if (size && v->shape[d] > 1 && stride != expected) {
-      if (!p->rows || d > 0 || stride < expected || stride % v->item) return false;
-      a->dense = false;
+      if (!p->rows_apart || d > 0 || stride < expected || stride % v->item) return false;
+      a->contiguous = false;
     }
     if (d == 0) a->row_bytes = v->shape[0] > 1 ? stride : expected;
     expected *= v->shape[d];
@@ -112,17 +112,18 @@ static bool take_layout(const parameter *p, const view *v, argument *a) {
   return v->aligned;
 }
 
-static bool take_array(call *c, int i, PyObject *object) {
+static bool call_take_array(call *c, int i, PyObject *object) {
   const parameter *p = &c->spec->parameters[i];
   view v;
-  if (!view_of(object, &v)) return call_refuse(c, i, PyExc_TypeError, "must be a dense tensor on the CPU");
+  if (!view_of(object, &v)) return call_refuse(c, i, PyExc_TypeError, "must be a strided tensor on the CPU");
   if (v.type != p->type) return call_refuse(c, i, PyExc_ValueError, "is of another type");
-  if (!take_shape(c, p, &v)) return call_refuse(c, i, PyExc_ValueError, "has another shape");
+  if (!call_take_shape(c, p, &v)) return call_refuse(c, i, PyExc_ValueError, "has another shape");
   if (p->filled && view_size(&v) == 0) return call_refuse(c, i, PyExc_ValueError, "has no elements");
-  return take_layout(p, &v, &c->arguments[i]) || call_refuse(c, i, PyExc_BufferError, "must be aligned and contiguous");
+  return argument_take_layout(p, &v, &c->arguments[i]) ||
+         call_refuse(c, i, PyExc_BufferError, "must be aligned and contiguous");
 }
 
-static bool take_number(call *c, int i, PyObject *object) {
+static bool call_take_number(call *c, int i, PyObject *object) {
   const parameter *p = &c->spec->parameters[i];
   argument *a = &c->arguments[i];
   if (p->kind == NUMBER) a->number = PyFloat_AsDouble(object);
@@ -223,9 +224,9 @@ static bool (*const checks[])(const argument *, int64_t, const argument *const[2
 static const char check_names[] = "offsets index permutation rising scenes segments corners";
 
 /* Copies integers to where no other thread can change them (frozen.h): all checks and the kernel read them there. */
-static bool secure(argument *a) {
+static bool argument_secure(argument *a) {
   if (!a->bytes) return true;
-  if ((a->frozen = find_frozen(a->data, a->bytes))) Py_INCREF(a->frozen->owner);
+  if ((a->frozen = frozen_find(a->data, a->bytes))) Py_INCREF(a->frozen->owner);
   void **copy = a->frozen ? &a->frozen->copied : &a->secured;
   if (!*copy) {
     if (!(*copy = malloc((size_t)a->bytes))) return PyErr_NoMemory(), false;
@@ -248,17 +249,17 @@ static bool check_values(const call *c, int at) {
   for (int i = 0; i < p->num_checks; i++) {
     const value_check *check = &p->checks[i];
     const argument *others[2];
-    fact found = {check->check, value_of(c, &check->bound), {0, 0}};
+    fact found = {check->check, call_value_of(c, &check->bound), {0, 0}};
     bool lasts = a->frozen;
     for (int j = 0; j < 2; j++) {
       others[j] = check->others[j] == NO_PARAMETER ? NULL : &c->arguments[check->others[j]];
       if (others[j] && others[j]->frozen) found.others[j] = others[j]->frozen->number;
       else if (others[j]) lasts = false;
     }
-    if (lasts && is_known(a->frozen, &found)) continue;
+    if (lasts && frozen_knows(a->frozen, &found)) continue;
     if (!checks[check->check](a, found.bound, others))
       return PyErr_Occurred() ? false : call_refuse(c, at, PyExc_ValueError, "has other values than its spec says");
-    if (lasts) remember(a->frozen, &found);
+    if (lasts) frozen_remember(a->frozen, &found);
   }
   return true;
 }
@@ -266,12 +267,12 @@ static bool check_values(const call *c, int at) {
 /* ---- all of them ---- */
 
 /* Whether the argument may be there, or may not, beside the others. */
-static bool may_be(const call *c, const parameter *p, bool given) {
+static bool call_may_have(const call *c, const parameter *p, bool given) {
   return (given || p->optional) && (p->with == NO_PARAMETER || given == !!c->arguments[p->with].data);
 }
 
 /* A letter that only absent inputs have is 0. Outputs bind no letter of an input: a kernel may look there. */
-static void bind_absent(call *c, bool of_inputs) {
+static void call_bind_absent(call *c, bool of_inputs) {
   for (int letter = 'A'; letter < LETTERS; letter++)
     if (c->size[letter] == UNBOUND && (!of_inputs || c->spec->of_inputs[letter])) c->size[letter] = 0;
 }
@@ -286,16 +287,17 @@ static bool call_take(call *c, PyObject *const *objects, Py_ssize_t num) {
   for (int i = 0; i < num; i++) {
     const parameter *p = &s->parameters[i];
     const bool given = objects[i] != Py_None;
-    if (i == s->num_inputs) bind_absent(c, true);
+    if (i == s->num_inputs) call_bind_absent(c, true);
     if (p->kind != ARRAY) {
-      if (!take_number(c, i, objects[i])) return false;
+      if (!call_take_number(c, i, objects[i])) return false;
       continue;
     }
-    if (!may_be(c, p, given)) return call_refuse(c, i, PyExc_ValueError, given ? "must be None" : "must not be None");
-    if (given && !take_array(c, i, objects[i])) return false;
-    if (given && !p->output && p->type != FLOATS && !secure(&c->arguments[i])) return false;
+    if (!call_may_have(c, p, given))
+      return call_refuse(c, i, PyExc_ValueError, given ? "must be None" : "must not be None");
+    if (given && !call_take_array(c, i, objects[i])) return false;
+    if (given && !p->output && p->type != FLOATS && !argument_secure(&c->arguments[i])) return false;
   }
-  bind_absent(c, false);
+  call_bind_absent(c, false);
   for (int i = 0; i < num; i++)
     if (c->arguments[i].data && !check_values(c, i)) return false;
   return true;
@@ -310,7 +312,7 @@ static bool call_begin(call *c) {
     if (c->spec->parameters[i].output) { /* all bits set: NaN, and -1 as an integer */
       const int64_t row = a->bytes / a->length;
       for (int64_t n = 0; n < a->length; n++) memset((char *)a->data + n * a->row_bytes, 0xff, (size_t)row);
-    } else if (a->dense) {
+    } else if (a->contiguous) {
       if (!(a->copy = malloc((size_t)a->bytes))) return PyErr_NoMemory(), false;
       memcpy(a->copy, a->data, (size_t)a->bytes);
     }
@@ -320,13 +322,13 @@ static bool call_begin(call *c) {
 
 /* Makes the outputs of a kernel that counts them, by the sizes in the call; false with an exception set if there is no
  * memory. */
-static bool make_outputs(call *c) {
+static bool call_make_outputs(call *c) {
   for (int i = c->spec->num_inputs; i < c->spec->num; i++) {
     argument *a = &c->arguments[i];
-    a->length = value_of(c, &c->spec->parameters[i].shape[0]);
+    a->length = call_value_of(c, &c->spec->parameters[i].shape[0]);
     a->row_bytes = sizeof(int64_t);
     a->bytes = a->length * a->row_bytes;
-    if (!(a->frozen = new_frozen(a->bytes))) return false;
+    if (!(a->frozen = frozen_new(a->bytes))) return false;
     a->data = a->frozen->shown;
   }
   return true;
@@ -334,13 +336,13 @@ static bool make_outputs(call *c) {
 
 /* Appends them to a list, as long as the sizes in the call say by now: where a kernel counts last, there was room for
  * more. */
-static bool append_outputs(call *c, PyObject *list) {
+static bool call_append_outputs(call *c, PyObject *list) {
   for (int i = c->spec->num_inputs; i < c->spec->num; i++) {
     frozen *f = c->arguments[i].frozen;
-    const int64_t length = value_of(c, &c->spec->parameters[i].shape[0]);
+    const int64_t length = call_value_of(c, &c->spec->parameters[i].shape[0]);
     f->bytes = length * (int64_t)sizeof(int64_t);
     c->arguments[i].frozen = NULL;
-    PyObject *array = array_of(f, 1, &length);
+    PyObject *array = frozen_array(f, 1, &length);
     const bool appended = array && PyList_Append(list, array) == 0;
     Py_XDECREF(array);
     if (!appended) return false;
@@ -354,7 +356,7 @@ static bool call_end(call *c, ast_status status) {
     argument *a = &c->arguments[i];
     if (!a->copy) continue;
     if (ok && memcmp(a->copy, a->data, (size_t)a->bytes))
-      ok = PyErr_Format(PyExc_AssertionError, "%s: the kernel changed its input %s", c->spec->name, name_of(c, i));
+      ok = PyErr_Format(PyExc_AssertionError, "%s: the kernel changed its input %s", c->spec->name, call_name_of(c, i));
     free(a->copy);
     a->copy = NULL;
   }

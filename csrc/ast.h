@@ -1,10 +1,10 @@
 /* The public C interface of the ast_sim core: status codes, types and one contract per kernel.
  *
  * Nothing here knows Python, torch or OpenMP. Sizes and indices are int64_t. Float arrays are float32, row major and
- * dense unless a row stride is an argument. Ragged batches are concatenated; `offsets` [B+1] starts at 0, never falls
- * and ends at the number of rows. Inputs are never changed and outputs are written in full. The caller has checked
- * shapes, offsets and index ranges (module.c does it for Python); a kernel checks only what it alone can see, such as a
- * point outside the cube.
+ * contiguous unless a row stride is an argument. Ragged batches are concatenated; `offsets` [B+1] starts at 0, never
+ * falls and ends at the number of rows. Inputs are never changed and outputs are written in full. The caller has
+ * checked shapes, offsets and index ranges (module.c does it for Python); a kernel checks only what it alone can see,
+ * such as a point outside the cube.
  *
  * Legend: B scenes, N nodes, C cells, T tokens, F channels, C_in and C_out channels of a convolution, D channels of a
  * head of attention, M rows of a dense layer (or edges, of S senders and R receivers), I and O its inputs and outputs.
@@ -222,7 +222,7 @@ typedef struct {
 
   /* Attention of the scores x = scale q[q,h] . k[k,h].
    *   q [Tq,H,D], k and v [Tk,H,D]: rows at the strides of s; D is a multiple of 16, at most 128
-   *   out [Tq,H,D], dense: out[q,h] = sum_k P[q,h,k] v[k,h], P = dropout(softmax_k(x))
+   *   out [Tq,H,D], contiguous: out[q,h] = sum_k P[q,h,k] v[k,h], P = dropout(softmax_k(x))
    *   maximum, sum [Tq,H]: max_k x and sum_k exp(x - maximum), so that log sum exp is maximum + log(sum)
    * Without keys: out 0, maximum -inf, sum 0. A row with a NaN or +inf score, or with only -inf, is NaN in all
    * outputs. */

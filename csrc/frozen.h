@@ -31,17 +31,17 @@ typedef struct frozen {
 
 static frozen *buckets[BUCKETS];
 
-static frozen **bucket_of(const void *shown) { return &buckets[(uintptr_t)shown / ALIGNMENT % BUCKETS]; }
+static frozen **frozen_bucket(const void *shown) { return &buckets[(uintptr_t)shown / ALIGNMENT % BUCKETS]; }
 
 /* The block of an array that is shown from this address on, or NULL. A part of one is not frozen. */
-static frozen *find_frozen(const void *shown, int64_t bytes) {
-  for (frozen *f = *bucket_of(shown); f; f = f->next)
+static frozen *frozen_find(const void *shown, int64_t bytes) {
+  for (frozen *f = *frozen_bucket(shown); f; f = f->next)
     if (f->shown == shown) return f->bytes == bytes ? f : NULL;
   return NULL;
 }
 
-static void forget(PyObject *capsule) {
-  frozen *f = PyCapsule_GetPointer(capsule, NULL), **link = bucket_of(f->shown);
+static void frozen_forget(PyObject *capsule) {
+  frozen *f = PyCapsule_GetPointer(capsule, NULL), **link = frozen_bucket(f->shown);
   while (*link != f) link = &(*link)->next;
   *link = f->next;
   free(f->copied);
@@ -49,24 +49,24 @@ static void forget(PyObject *capsule) {
 }
 
 /* Never 0, so that every block has an address of its own. */
-static int64_t aligned(int64_t bytes) { return bytes / ALIGNMENT * ALIGNMENT + ALIGNMENT; }
+static int64_t frozen_aligned(int64_t bytes) { return bytes / ALIGNMENT * ALIGNMENT + ALIGNMENT; }
 
 /* A new block; its values are unset. */
-static frozen *new_frozen(int64_t bytes) {
+static frozen *frozen_new(int64_t bytes) {
   static int64_t number;
-  const int64_t head = aligned(sizeof(frozen));
-  char *memory = aligned_alloc(ALIGNMENT, (size_t)(head + aligned(bytes)));
+  const int64_t head = frozen_aligned(sizeof(frozen));
+  char *memory = aligned_alloc(ALIGNMENT, (size_t)(head + frozen_aligned(bytes)));
   if (!memory) return (void)PyErr_NoMemory(), NULL;
-  frozen *f = (frozen *)memory, **bucket = bucket_of(memory + head);
+  frozen *f = (frozen *)memory, **bucket = frozen_bucket(memory + head);
   *f = (frozen){.shown = memory + head, .bytes = bytes, .number = ++number};
-  if (!(f->owner = PyCapsule_New(f, NULL, forget))) return free(f), NULL;
+  if (!(f->owner = PyCapsule_New(f, NULL, frozen_forget))) return free(f), NULL;
   f->next = *bucket;
   *bucket = f;
   return f;
 }
 
 /* The array over what is shown, which from now on owns the block. */
-static PyObject *array_of(frozen *f, int ndim, const int64_t *shape) {
+static PyObject *frozen_array(frozen *f, int ndim, const int64_t *shape) {
   npy_intp lengths[MAX_SHAPE];
   for (int d = 0; d < ndim; d++) lengths[d] = (npy_intp)shape[d];
   PyObject *array = PyArray_SimpleNewFromData(ndim, lengths, INTS, f->shown);
@@ -76,12 +76,12 @@ static PyObject *array_of(frozen *f, int ndim, const int64_t *shape) {
   return array;
 }
 
-static bool is_known(const frozen *f, const fact *wanted) {
+static bool frozen_knows(const frozen *f, const fact *wanted) {
   for (int i = 0; i < f->num_facts && i < MAX_FACTS; i++)
     if (memcmp(&f->facts[i], wanted, sizeof *wanted) == 0) return true;
   return false;
 }
 
-static void remember(frozen *f, const fact *found) { f->facts[f->num_facts++ % MAX_FACTS] = *found; }
+static void frozen_remember(frozen *f, const fact *found) { f->facts[f->num_facts++ % MAX_FACTS] = *found; }
 
 #endif

@@ -22,24 +22,24 @@ static PyObject *module_call_kernel(PyObject *self, PyObject *const *objects, Py
 
 /* Whether this is something that a kernel reads as indices in place. */
 static bool module_take_indices(PyObject *object, view *v, argument *a) {
-  static const parameter dense;
-  return view_of(object, v) && v->type == INTS && v->ndim >= 1 && v->ndim <= MAX_SHAPE && take_layout(&dense, v, a) &&
-         a->bytes;
+  static const parameter contiguous;
+  return view_of(object, v) && v->type == INTS && v->ndim >= 1 && v->ndim <= MAX_SHAPE &&
+         argument_take_layout(&contiguous, v, a) && a->bytes;
 }
 
 /* A new array with these values, which kernels trust from now on (frozen.h). */
 static PyObject *module_frozen_copy(const view *v, const argument *a) {
-  frozen *f = new_frozen(a->bytes);
+  frozen *f = frozen_new(a->bytes);
   if (!f) return NULL;
   memcpy(f->shown, a->data, (size_t)a->bytes);
-  return array_of(f, v->ndim, v->shape);
+  return frozen_array(f, v->ndim, v->shape);
 }
 
 /* The same object if there is nothing to do: it is frozen already, or no indices. */
 static PyObject *module_freeze_one(PyObject *object) {
   view v;
   argument a;
-  if (module_take_indices(object, &v, &a) && !find_frozen(a.data, a.bytes)) return module_frozen_copy(&v, &a);
+  if (module_take_indices(object, &v, &a) && !frozen_find(a.data, a.bytes)) return module_frozen_copy(&v, &a);
   return Py_INCREF(object), object;
 }
 
@@ -47,9 +47,9 @@ static PyObject *module_freeze_one(PyObject *object) {
 static PyObject *module_read_one(PyObject *object) {
   view v;
   argument a;
-  if (!module_take_indices(object, &v, &a) || !find_frozen(a.data, a.bytes)) return Py_INCREF(object), object;
+  if (!module_take_indices(object, &v, &a) || !frozen_find(a.data, a.bytes)) return Py_INCREF(object), object;
   PyObject *values = NULL;
-  if (secure(&a)) {
+  if (argument_secure(&a)) {
     if (memcmp(a.data, a.frozen->shown, (size_t)a.bytes)) values = module_frozen_copy(&v, &a);
     else Py_INCREF(values = object);
   }
@@ -88,7 +88,7 @@ static PyObject *module_declare(PyObject *module, PyObject *arguments) {
   while (i < num && strcmp(bindings[i].spec.name, name) != 0) i++;
   if (i == num) return PyErr_Format(PyExc_ValueError, "declare: there is no kernel %s", name);
   spec *s = &bindings[i].spec;
-  if (!read_spec(s, names, numbers, bytes))
+  if (!spec_read(s, names, numbers, bytes))
     return PyErr_Format(PyExc_ValueError, "declare: %s takes (%s), its spec says something else", name, s->names);
   kernel_methods[i] = (PyMethodDef){s->name, (PyCFunction)(void (*)(void))module_call_kernel, METH_FASTCALL, s->names};
   PyObject *self = PyCapsule_New(&bindings[i], NULL, NULL);

@@ -57,22 +57,20 @@ static bool call_run(call *c, run_function function, void *result, ast_status *s
 /* ---- sums of rows ---- */
 
 KERNEL(segment_sum, x, node_order, node_offsets, mean, out) {
-  return chosen_kernels()->segment_sum(a->x.data, n['F'], a->node_order.data, a->node_offsets.data, n['C'],
-                                       a->mean.integer, a->out.data);
+  return call_table()->segment_sum(a->x.data, n['F'], a->node_order.data, a->node_offsets.data, n['C'], a->mean.integer,
+                                   a->out.data);
 }
 
 KERNEL(segment_spread, dout, node_order, node_offsets, mean, dx) {
-  return chosen_kernels()->segment_spread(a->dout.data, n['F'], a->node_order.data, a->node_offsets.data, n['C'],
-                                          a->mean.integer, a->dx.data);
+  return call_table()->segment_spread(a->dout.data, n['F'], a->node_order.data, a->node_offsets.data, n['C'],
+                                      a->mean.integer, a->dx.data);
 }
 
-KERNEL(column_sum, x, out) { return chosen_kernels()->column_sum(a->x.data, n['N'], n['F'], a->out.data); }
+KERNEL(column_sum, x, out) { return call_table()->column_sum(a->x.data, n['N'], n['F'], a->out.data); }
 
 /* ---- the step of Muon ---- */
 
-KERNEL(orthogonalize, x, out) {
-  return chosen_kernels()->orthogonalize(a->x.data, n['K'], n['R'], n['C'], a->out.data);
-}
+KERNEL(orthogonalize, x, out) { return call_table()->orthogonalize(a->x.data, n['K'], n['R'], n['C'], a->out.data); }
 
 /* ---- elastic forces ---- */
 
@@ -86,12 +84,12 @@ static ast_elastic elastic_of(const void *arguments, const int64_t *n) {
 
 KERNEL(elastic_forces, ELASTIC, force) {
   const ast_elastic s = elastic_of(a, n);
-  return chosen_kernels()->elastic_forces(&s, a->force.data);
+  return call_table()->elastic_forces(&s, a->force.data);
 }
 
 KERNEL(elastic_forces_backward, dforce, ELASTIC, dposition) {
   const ast_elastic s = elastic_of(&a->position, n);
-  return chosen_kernels()->elastic_forces_backward(&s, a->dforce.data, a->dposition.data);
+  return call_table()->elastic_forces_backward(&s, a->dforce.data, a->dposition.data);
 }
 
 /* ---- proximity ---- */
@@ -100,7 +98,7 @@ KERNEL(elastic_forces_backward, dforce, ELASTIC, dposition) {
 
 KERNEL(proximity, PROXIMITY, radius, out) {
   const ast_proximity s = {LIST_OF(SIZE, B, N, F), LIST_OF(FIELD, PROXIMITY), .radius = a->radius.number};
-  return chosen_kernels()->proximity(&s, a->out.data);
+  return call_table()->proximity(&s, a->out.data);
 }
 
 static bool proximity_check(const call *c) {
@@ -115,40 +113,40 @@ static bool proximity_check(const call *c) {
 /* ---- the order of nodes ---- */
 
 KERNEL(breadth_first, elements, wanted, rank) {
-  return chosen_kernels()->breadth_first(a->elements.data, n['E'], n['K'], a->wanted.data, n['N'], a->rank.data);
+  return call_table()->breadth_first(a->elements.data, n['E'], n['K'], a->wanted.data, n['N'], a->rank.data);
 }
 
 /* ---- meshes ---- */
 
 KERNEL(counting_sort, num, index, order, offsets) {
-  return chosen_kernels()->counting_sort(a->index.data, n['M'], n['N'], a->order.data, a->offsets.data);
+  return call_table()->counting_sort(a->index.data, n['M'], n['N'], a->order.data, a->offsets.data);
 }
 
 KERNEL(mesh_edges, num_nodes, elements, ends, senders, receivers, offsets) {
-  return chosen_kernels()->mesh_edges(a->elements.data, n['E'], n['K'], a->ends.data, n['P'], n['N'], a->senders.data,
-                                      a->receivers.data, a->offsets.data);
+  return call_table()->mesh_edges(a->elements.data, n['E'], n['K'], a->ends.data, n['P'], n['N'], a->senders.data,
+                                  a->receivers.data, a->offsets.data);
 }
 
 static bool mesh_edges_count(call *c, PyObject *list) {
   const mesh_edges_arguments *a = (const void *)c->arguments;
   ast_status status;
   c->size['M'] = 2 * c->size['P'] * c->size['E']; /* room; pages that stay empty take no memory */
-  if (!make_outputs(c) || !call_run(c, mesh_edges_run, NULL, &status)) return false;
+  if (!call_make_outputs(c) || !call_run(c, mesh_edges_run, NULL, &status)) return false;
   c->size['M'] = ((const int64_t *)a->offsets.data)[c->size['N']];
-  return append_outputs(c, list);
+  return call_append_outputs(c, list);
 }
 
 KERNEL(outer_faces, num_nodes, elements, faces, outer) {
-  return chosen_kernels()->outer_faces(a->elements.data, n['E'], n['K'], a->faces.data, n['Q'], a->outer.data, result);
+  return call_table()->outer_faces(a->elements.data, n['E'], n['K'], a->faces.data, n['Q'], a->outer.data, result);
 }
 
 static bool outer_faces_count(call *c, PyObject *list) {
   ast_status status;
   int64_t num = 0;
   c->size['F'] = c->size['E'] * c->size['Q'];
-  if (!make_outputs(c) || !call_run(c, outer_faces_run, &num, &status)) return false;
+  if (!call_make_outputs(c) || !call_run(c, outer_faces_run, &num, &status)) return false;
   c->size['F'] = num;
-  return append_outputs(c, list);
+  return call_append_outputs(c, list);
 }
 
 /* ---- octree ---- */
@@ -156,9 +154,9 @@ static bool outer_faces_count(call *c, PyObject *list) {
 KERNEL(octree, positions, offsets, x, y, z, half_width, depth, keys, cell_offsets, node_cell, node_order,
        node_offsets) {
   const double center[3] = {a->x.number, a->y.number, a->z.number};
-  return chosen_kernels()->octree_build(a->positions.data, a->offsets.data, n['B'], center, a->half_width.number,
-                                        (int)a->depth.integer, a->keys.data, a->cell_offsets.data, a->node_cell.data,
-                                        a->node_order.data, a->node_offsets.data, result);
+  return call_table()->octree_build(a->positions.data, a->offsets.data, n['B'], center, a->half_width.number,
+                                    (int)a->depth.integer, a->keys.data, a->cell_offsets.data, a->node_cell.data,
+                                    a->node_order.data, a->node_offsets.data, result);
 }
 
 static bool octree_check(const call *c) {
@@ -173,30 +171,30 @@ static bool octree_count(call *c, PyObject *list) {
   ast_status status;
   int64_t bad = 0;
   c->size['C'] = c->size['N']; /* room for a cell a node */
-  if (!make_outputs(c) || !call_run(c, octree_run, &bad, &status)) return false;
+  if (!call_make_outputs(c) || !call_run(c, octree_run, &bad, &status)) return false;
   if (status != AST_OK)
     return PyErr_Format(PyExc_ValueError, "octree: positions[%lld]: %s", (long long)bad, ast_status_text(status)),
            false;
   c->size['C'] = ((const int64_t *)a->cell_offsets.data)[c->size['B']];
-  return append_outputs(c, list);
+  return call_append_outputs(c, list);
 }
 
 KERNEL(octree_coordinates, keys, coordinates) {
-  return chosen_kernels()->octree_coordinates(a->keys.data, n['C'], a->coordinates.data);
+  return call_table()->octree_coordinates(a->keys.data, n['C'], a->coordinates.data);
 }
 
 KERNEL(octree_coarsen, keys, cell_offsets, levels, coarse_keys, coarse_offsets, first_child, node_cell, pair_offsets,
        fine, coarse, fine_by_fine, coarse_by_fine) {
-  return chosen_kernels()->octree_coarsen(a->keys.data, a->cell_offsets.data, n['B'], (int)a->levels.integer, result);
+  return call_table()->octree_coarsen(a->keys.data, a->cell_offsets.data, n['B'], (int)a->levels.integer, result);
 }
 
 static ast_status octree_coarsen_write(const argument *arguments, UNUSED const int64_t *n, void *result) {
   const octree_coarsen_arguments *a = (const void *)arguments;
   const ast_octree_level *level = result;
   memcpy(a->pair_offsets.data, level->pair_offsets, sizeof level->pair_offsets);
-  return chosen_kernels()->octree_write_level(level, a->coarse_keys.data, a->coarse_offsets.data, a->first_child.data,
-                                              a->node_cell.data, a->fine.data, a->coarse.data, a->fine_by_fine.data,
-                                              a->coarse_by_fine.data);
+  return call_table()->octree_write_level(level, a->coarse_keys.data, a->coarse_offsets.data, a->first_child.data,
+                                          a->node_cell.data, a->fine.data, a->coarse.data, a->fine_by_fine.data,
+                                          a->coarse_by_fine.data);
 }
 
 /* The outputs of all levels. The list exists before the kernel runs, and arrays are no objects of the garbage
@@ -212,7 +210,7 @@ static bool octree_coarsen_count(call *c, PyObject *list) {
     c->size['N'] = level[j].C_fine;
     c->size['C'] = level[j].C;
     c->size['P'] = level[j].pair_offsets[27];
-    ok = make_outputs(c) && call_run(c, octree_coarsen_write, &level[j], &status) && append_outputs(c, list);
+    ok = call_make_outputs(c) && call_run(c, octree_coarsen_write, &level[j], &status) && call_append_outputs(c, list);
   }
   return ok;
 }
@@ -228,7 +226,7 @@ KERNEL(farthest_point_sample, coordinates, offsets, num, indices, out_offsets) {
     const int64_t points = offsets[b + 1] - offsets[b];
     out[b + 1] = out[b] + (points < num ? points : num);
   }
-  return chosen_kernels()->farthest_point_sample(a->coordinates.data, offsets, n['B'], num, out, a->indices.data);
+  return call_table()->farthest_point_sample(a->coordinates.data, offsets, n['B'], num, out, a->indices.data);
 }
 
 static bool farthest_point_sample_count(call *c, PyObject *list) {
@@ -236,10 +234,10 @@ static bool farthest_point_sample_count(call *c, PyObject *list) {
   const int64_t points = c->size['C'], scenes = c->size['B'], num = a->num.integer;
   ast_status status;
   c->size['S'] = scenes && num <= (points - 1) / scenes ? scenes * num : points; /* room */
-  if (!make_outputs(c) || !call_run(c, farthest_point_sample_run, NULL, &status)) return false;
+  if (!call_make_outputs(c) || !call_run(c, farthest_point_sample_run, NULL, &status)) return false;
   if (status != AST_OK) return call_fail(c, ast_status_text(status));
   c->size['S'] = ((const int64_t *)a->out_offsets.data)[scenes];
-  return append_outputs(c, list);
+  return call_append_outputs(c, list);
 }
 
 /* ---- sparse convolution ---- */
@@ -247,13 +245,13 @@ static bool farthest_point_sample_count(call *c, PyObject *list) {
 /* Transposed, the spec gives the axes of the weight the other way round. */
 KERNEL(sparse_conv, x, weight, bias, transposed, pair_offsets, source, destination, out) {
   const ast_pairs pairs = {a->pair_offsets.data, a->source.data, a->destination.data};
-  return chosen_kernels()->sparse_conv(a->x.data, a->weight.data, a->bias.data, n['I'], n['O'], a->transposed.integer,
-                                       pairs, n['R'], a->out.data);
+  return call_table()->sparse_conv(a->x.data, a->weight.data, a->bias.data, n['I'], n['O'], a->transposed.integer,
+                                   pairs, n['R'], a->out.data);
 }
 
 KERNEL(sparse_conv_weight, x, dout, pair_offsets, source, destination, dweight) {
   const ast_pairs pairs = {a->pair_offsets.data, a->source.data, a->destination.data};
-  return chosen_kernels()->sparse_conv_weight(a->x.data, a->dout.data, n['I'], n['O'], pairs, a->dweight.data);
+  return call_table()->sparse_conv_weight(a->x.data, a->dout.data, n['I'], n['O'], pairs, a->dweight.data);
 }
 
 /* ---- attention ---- */
@@ -276,7 +274,7 @@ static ast_attention attention_of(const void *arguments, const int64_t *n) {
 
 KERNEL(attention, ATTENTION) {
   const ast_attention s = attention_of(a, n);
-  return chosen_kernels()->attention(&s, a->q.data, a->k.data, a->v.data, a->out.data, a->maximum.data, a->total.data);
+  return call_table()->attention(&s, a->q.data, a->k.data, a->v.data, a->out.data, a->maximum.data, a->total.data);
 }
 
 KERNEL(attention_backward, ATTENTION, dout, dq, dk, dv) {
@@ -284,8 +282,8 @@ KERNEL(attention_backward, ATTENTION, dout, dq, dk, dv) {
   s.dq_stride = a->dq.row_stride;
   s.dk_stride = a->dk.row_stride;
   s.dv_stride = a->dv.row_stride;
-  return chosen_kernels()->attention_backward(&s, a->q.data, a->k.data, a->v.data, a->out.data, a->maximum.data,
-                                              a->total.data, a->dout.data, a->dq.data, a->dk.data, a->dv.data);
+  return call_table()->attention_backward(&s, a->q.data, a->k.data, a->v.data, a->out.data, a->maximum.data,
+                                          a->total.data, a->dout.data, a->dq.data, a->dk.data, a->dv.data);
 }
 
 /* ---- message passing ---- */
@@ -308,14 +306,14 @@ static bool message_check(const call *c) {
 
 KERNEL(message, MESSAGE, sum, messages) {
   const ast_message s = message_of(a, n);
-  return chosen_kernels()->message(&s, a->sum.data, a->messages.data);
+  return call_table()->message(&s, a->sum.data, a->messages.data);
 }
 
 KERNEL(message_backward, dsum, dmessages, MESSAGE, dof_senders, dof_receivers, dedge_features, dA1, da1, dA2, dW2, db2,
        dgamma, dbeta) {
   const ast_message s = message_of(&a->of_senders, n);
   const ast_message_gradients gradients = {LIST_OF(GRADIENT, MESSAGE_FLOATS)};
-  return chosen_kernels()->message_backward(&s, a->dsum.data, a->dmessages.data, &gradients);
+  return call_table()->message_backward(&s, a->dsum.data, a->dmessages.data, &gradients);
 }
 
 /* ---- dense layers ---- */
@@ -334,15 +332,14 @@ static ast_linear linear_of(const argument *x, const argument *weight, const int
 KERNEL(linear, x, weight, bias, residual, activation, out, z) {
   ast_linear s = linear_of(&a->x, &a->weight, n, a->activation.integer);
   s.residual_stride = a->residual.row_stride;
-  return chosen_kernels()->linear(&s, a->x.data, a->weight.data, a->bias.data, a->residual.data, a->out.data,
-                                  a->z.data);
+  return call_table()->linear(&s, a->x.data, a->weight.data, a->bias.data, a->residual.data, a->out.data, a->z.data);
 }
 
 KERNEL(linear_backward, dout, x, weight, bias, z, activation, dx, dweight, dbias) {
   ast_linear s = linear_of(&a->x, &a->weight, n, a->activation.integer);
   s.dout_stride = a->dout.row_stride;
-  return chosen_kernels()->linear_backward(&s, a->dout.data, a->x.data, a->weight.data, a->bias.data, a->z.data,
-                                           a->dx.data, a->dweight.data, a->dbias.data);
+  return call_table()->linear_backward(&s, a->dout.data, a->x.data, a->weight.data, a->bias.data, a->z.data, a->dx.data,
+                                       a->dweight.data, a->dbias.data);
 }
 
 #define MLP x, beside, weight1, bias1, weight2, bias2, gamma, beta
@@ -359,14 +356,14 @@ static ast_mlp mlp_of(const void *arguments, const int64_t *n) {
 KERNEL(mlp, MLP, residual, out, MLP_KEPT) {
   ast_mlp s = mlp_of(a, n);
   s.residual_stride = a->residual.row_stride;
-  return chosen_kernels()->mlp(&s, a->residual.data, a->out.data, (ast_mlp_kept){LIST_OF(FIELD, MLP_KEPT)});
+  return call_table()->mlp(&s, a->residual.data, a->out.data, (ast_mlp_kept){LIST_OF(FIELD, MLP_KEPT)});
 }
 
 KERNEL(mlp_backward, dout, MLP, MLP_KEPT, dx, dbeside, dweight1, dbias1, dweight2, dbias2, dgamma, dbeta) {
   ast_mlp s = mlp_of(&a->x, n);
   s.dout_stride = a->dout.row_stride;
-  return chosen_kernels()->mlp_backward(&s, a->dout.data, (ast_mlp_kept){LIST_OF(FIELD, MLP_KEPT)},
-                                        (ast_mlp_gradients){LIST_OF(GRADIENT, MLP)});
+  return call_table()->mlp_backward(&s, a->dout.data, (ast_mlp_kept){LIST_OF(FIELD, MLP_KEPT)},
+                                    (ast_mlp_gradients){LIST_OF(GRADIENT, MLP)});
 }
 
 /* ---- attention blocks ---- */
@@ -387,14 +384,14 @@ static ast_attention_block block_of(const void *arguments, const int64_t *n) {
 
 KERNEL(attention_block, BLOCK_ROWS, BLOCK_WEIGHTS, heads, out, BLOCK_KEPT) {
   const ast_attention_block s = block_of(a, n);
-  return chosen_kernels()->attention_block(&s, a->out.data, (ast_attention_block_kept){LIST_OF(FIELD, BLOCK_KEPT)});
+  return call_table()->attention_block(&s, a->out.data, (ast_attention_block_kept){LIST_OF(FIELD, BLOCK_KEPT)});
 }
 
 KERNEL(attention_block_backward, dout, BLOCK_ROWS, BLOCK_WEIGHTS, heads, BLOCK_KEPT, dx, dcontext, dgamma, dbeta,
        dcontext_gamma, dcontext_beta, dquery, dkey_value, dweight, dbias, dinner_gamma, dinner_beta, dfirst,
        dfirst_bias, dsecond, dsecond_bias) {
   const ast_attention_block s = block_of(&a->x, n);
-  return chosen_kernels()->attention_block_backward(
+  return call_table()->attention_block_backward(
       &s, a->dout.data, (ast_attention_block_kept){LIST_OF(FIELD, BLOCK_KEPT)},
       (ast_attention_block_gradients){LIST_OF(GRADIENT, x, context), LIST_OF(GRADIENT, BLOCK_WEIGHTS)});
 }

@@ -1,7 +1,7 @@
 /* The register tiles of the sparse convolution: products of rows that lie anywhere, without a copy of them.
  *
  *   row_panel:     out_i = base_i + sum_k A_ik B_kj     rows i of A and out by pointer, a panel of B packed (gemm.h)
- *   column_panel:  out_ij = base_ij + sum_k A_ki B_kj   rows k of A and B by pointer, out dense
+ *   column_panel:  out_ij = base_ij + sum_k A_ki B_kj   rows k of A and B by pointer, out contiguous
  *
  * A strip has any number of rows i up to GEMM_ROWS: tiles are cut evenly, since the cut of gemm.h costs 6 to 19 % where
  * 48 pairs come at a time. A panel has up to GEMM_COLUMNS columns j. `base` is out itself or what it starts from (a

@@ -1,6 +1,6 @@
 /* What a kernel takes: its spec, which ast_sim/ops/spec.py takes apart once at import and hands over in numbers.
  *
- *   x[M,I] rows, weight[O,I] filled, bias?[O], source[P] index(M), depth integer(0,21) -> out[M,O]
+ *   x[M,I] rows_apart, weight[O,I] filled, bias?[O], source[P] index(M), depth integer(0,21) -> out[M,O]
  *
  * An array has a dimension for each axis: a number, a letter, or a sum such as 4E, C+1, I+J. A letter binds at first
  * sight; the same letter is the same size ever after. `?` allows None. Behind the arrow stand outputs. README.md lists
@@ -31,7 +31,7 @@ typedef struct {
 
 typedef struct {
   int64_t kind, type;
-  int64_t optional, output, rows, filled; /* rows: they may lie apart; filled: there must be elements */
+  int64_t optional, output, rows_apart, filled; /* rows_apart: they may be; filled: there must be elements */
   int64_t low, high; /* of an integer from low to high, or of a number in [low, high) if low < high */
   int64_t with;      /* given exactly if that parameter is */
   int64_t ndim, num_checks;
@@ -48,7 +48,7 @@ typedef struct {
 } spec;
 
 /* False if these are the numbers of no spec of a kernel with such parameters. */
-static bool read_spec(spec *s, const char *names, const char *numbers, Py_ssize_t bytes) {
+static bool spec_read(spec *s, const char *names, const char *numbers, Py_ssize_t bytes) {
   s->num = (int)(bytes / (Py_ssize_t)sizeof(parameter));
   if (strcmp(s->names, names) != 0 || s->num > MAX_PARAMETERS || bytes % (Py_ssize_t)sizeof(parameter)) return false;
   memcpy(s->parameters, numbers, (size_t)bytes);

@@ -57,7 +57,7 @@ typedef struct {
 } dlpack_exchange;
 
 /* The exchange of a type and of types derived from it, kept from call to call; NULL for what is no tensor. */
-static const dlpack_exchange *exchange_of(PyTypeObject *type) {
+static const dlpack_exchange *view_exchange(PyTypeObject *type) {
   static PyTypeObject *known;
   static const dlpack_exchange *exchange;
   if (known && PyType_IsSubtype(type, known)) return exchange;
@@ -72,7 +72,7 @@ static const dlpack_exchange *exchange_of(PyTypeObject *type) {
   return exchange = found;
 }
 
-static int type_of_tensor(const dlpack_tensor *t) {
+static int view_type(const dlpack_tensor *t) {
   if (t->lanes != 1) return OTHER_TYPE;
   if (t->code == DLPACK_FLOAT && t->bits == 32) return FLOATS;
   if (t->code == DLPACK_INT && t->bits == 64) return INTS;
@@ -80,9 +80,9 @@ static int type_of_tensor(const dlpack_tensor *t) {
   return OTHER_TYPE;
 }
 
-/* Whether the object is a dense tensor in this machine's memory. */
+/* Whether the object is a strided tensor in this machine's memory. */
 static bool view_of(PyObject *object, view *v) {
-  const dlpack_exchange *exchange = exchange_of(Py_TYPE(object));
+  const dlpack_exchange *exchange = view_exchange(Py_TYPE(object));
   dlpack_tensor t;
   if (!exchange) return false;
   if (exchange->look(object, &t) != 0) return PyErr_Clear(), false;
@@ -90,7 +90,7 @@ static bool view_of(PyObject *object, view *v) {
   const int64_t item = (t.bits * t.lanes + 7) / 8;
   char *data = t.data ? (char *)t.data + t.byte_offset : nothing;
   *v = (view){.data = data,
-              .type = type_of_tensor(&t),
+              .type = view_type(&t),
               .ndim = t.ndim,
               .item = item,
               .aligned = item && (uintptr_t)data % (uintptr_t)item == 0};

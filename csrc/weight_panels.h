@@ -156,7 +156,7 @@ typedef struct {
   int64_t residual_row;
   const float *hidden; /* or NULL; out is 0 where this is not above 0: the gradient of ReLU */
   int64_t hidden_row;
-  float *z; /* what enters the activation, or NULL: [*, N], paired [*, 2N], dense */
+  float *z; /* what enters the activation, or NULL: [*, N], paired [*, 2N], contiguous */
   dense_next next[DENSE_NEXT];
 } dense_end;
 

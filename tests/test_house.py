@@ -22,6 +22,7 @@ from ast_sim.simulate.shapes.cad.gmsh_process import MESHING_MODULE
 REPOSITORY = Path(__file__).parent.parent
 ROOT = REPOSITORY / "ast_sim"
 MODULE_FILES = sorted(ROOT.rglob("*.py"))
+BENCHMARKS = sorted((REPOSITORY / "benchmarks").rglob("*.py"))
 FOLDERS = sorted({path.parent for path in MODULE_FILES})
 
 MOST_MODULE_LINES = 350
@@ -139,7 +140,7 @@ def test_nothing_outside_imports_a_private_module_of_ops():
     for line in ("from ast_sim.ops import linear, _mlp", "from ast_sim.ops._mlp import mlp", "import ast_sim.ops._mlp"):
         assert len(private_ops(line)) == 1, line
     assert not private_ops("from ast_sim.ops.library import Op\nfrom ast_sim.models import _own")
-    outside = [path for path in MODULE_FILES if ROOT / "ops" not in path.parents]
+    outside = [path for path in [*MODULE_FILES, *BENCHMARKS] if ROOT / "ops" not in path.parents]
     assert len(outside) > 100 and not [path for path in outside if private_ops(path.read_text(encoding="utf-8"))]
 
 
@@ -156,75 +157,109 @@ def alike(values: list[ast.expr]) -> bool:
     return len(functions) == len(values) and of_one
 
 
+def number_kind(value: ast.expr) -> str:
+    """Whether a value that the line spells out is a whole number or not; empty for what is no such number."""
+    if isinstance(value, ast.Constant):
+        return type(value.value).__name__ if type(value.value) in (int, float) else ""
+    if isinstance(value, ast.UnaryOp):
+        return number_kind(value.operand)
+    if not isinstance(value, ast.BinOp):
+        return ""
+    sides = {number_kind(value.left), number_kind(value.right)}
+    if "" in sides:
+        return ""
+    return "float" if "float" in sides or isinstance(value.op, ast.Div) else "int"
+
+
 def written_out(value: ast.expr) -> str:
     """The kind of a value that the line spells out: a number, a text, None, a flag, a list, ...; else empty."""
-    if isinstance(value, ast.UnaryOp | ast.BinOp):
-        parts = [value.operand] if isinstance(value, ast.UnaryOp) else [value.left, value.right]
-        return "number" if {written_out(part) for part in parts} == {"number"} else ""
+    if kind := number_kind(value):
+        return kind
     if isinstance(value, ast.Constant):
-        return "number" if type(value.value) in (int, float) else type(value.value).__name__
+        return type(value.value).__name__
     kind = {ast.JoinedStr: "str", ast.ListComp: "List", ast.SetComp: "Set", ast.DictComp: "Dict"}.get(type(value))
     return kind or (type(value).__name__ if isinstance(value, ast.List | ast.Set | ast.Dict | ast.Tuple) else "")
 
 
+def items_of_one(items: list[ast.Subscript]) -> bool:
+    """Whether these are items of one object, or those of several objects at one place."""
+    objects = {ast.unparse(item.value) for item in items}
+    places = {ast.unparse(item.slice) for item in items}
+    return len(objects) == 1 or len(places) == 1
+
+
 def mixed(values: list[ast.expr]) -> bool:
-    """Whether values that one line assigns are unlike: what is written out stands beside its kind only, a call beside
-    calls of its function only, and a choice (`a if b else c`, `a or b`) beside nothing."""
-    if any(isinstance(value, ast.IfExp | ast.BoolOp) for value in values):
+    """Whether values that one line assigns are unlike, or belong together by nothing that the line shows."""
+    kinds = {written_out(value) or type(value).__name__ for value in values}
+    if len(kinds) > 1 or kinds & {"IfExp", "BoolOp", "Name", "Attribute"}:
         return True
-    calls = any(isinstance(value, ast.Call) for value in values)
-    return len({written_out(value) for value in values}) > 1 or (calls and not alike(values))
+    if kinds == {"Subscript"}:
+        return not items_of_one(values)
+    return kinds == {"Call"} and not alike(values)
+
+
+def swapped(targets: list[ast.expr], values: list[ast.expr]) -> bool:
+    """Whether an assignment only changes the order of what stands on its left."""
+    return sorted(map(ast.unparse, targets)) == sorted(map(ast.unparse, values))
+
+
+def side_by_side(node: ast.AST) -> bool:
+    """Whether a line assigns several values to several names, attributes or items, which take a line each."""
+    if not (isinstance(node, ast.Assign) and isinstance(node.value, ast.Tuple)):
+        return False
+    targets, values = [getattr(side, "elts", []) for side in (node.targets[0], node.value)]
+    if not targets or swapped(targets, values):
+        return False
+    return mixed(values) or not all(isinstance(target, ast.Name) for target in targets)
 
 
 def folded(source: str) -> list[str]:
-    """The assignments of unlike values to several names, and the assignments to a name that says nothing."""
-    bad = []
-    for node in ast.walk(ast.parse(source)):
-        if (
-            isinstance(node, ast.Assign)
-            and isinstance(node.value, ast.Tuple)
-            and isinstance(node.targets[0], ast.Tuple)
-            and mixed(node.value.elts)
-        ):
-            bad.append(f"{node.lineno}: {ast.unparse(node)}")
-        named = node.arg if isinstance(node, ast.arg) else node.id if isinstance(node, ast.Name) else ""
-        if named in NO_NOUNS:
-            bad.append(f"{node.lineno}: {named}")
-    return bad
+    """The assignments of unlike values to several names, and of several values to attributes or items."""
+    nodes = [node for node in ast.walk(ast.parse(source)) if side_by_side(node)]
+    return [f"{node.lineno}: {ast.unparse(node)}" for node in nodes]
 
 
 def test_what_is_folded_is_seen():
-    named = ("found = 1", "a = found", "def f(ways): 0")
+    """A line may assign several values to names where it shows what makes them one idea: literals of one kind, calls of
+    one function or of one object, items of one object or at one place of several, sums of names. It may swap, and it
+    may take one value apart: the result of a call, a shape, a generator. All else takes a line each: attributes, names,
+    choices (`x if y else z`, `x or y`), values of unlike kinds, and whatever is assigned to attributes or items."""
     choices = ("a, b = x if y else z, u", "a, b = f(x), y or z", "a, b = x or y, u or v")
-    beside = (
-        "0, n",
-        "None, 0.0",
-        "None, ''",
-        "[], {}",
-        "[], n",
-        "0, False",
-        "'none', ()",
-        "x, f'{y}'",
-        "[i for i in x], y",
-    )
+    beside = ("0, n", "None, 0.0", "None, ''", "[], {}", "[], n", "0, False", "'none', ()", "[i for i in x], y")
+    beside += ("x, f'{y}'", "4, 0.1", "-1, 2**23 / 3", "x + 1, y[0]", "x, y", "x.u, y.u", "x.u, x.v", "x[0], y[1]")
     calls = ("a, b = f(x), g(y)", "a, b = 1, g(y)", "a, b = np.zeros(3), np.ones(3)")
-    for line in (*calls, *choices, *(f"a, b = {values}" for values in beside), *named):
+    targets = ("self.a, self.b = x, y", "self.a, self.b = 0, 0", "a, self.b = f(x), f(y)", "a[0], a[1] = f(x), f(y)")
+    for line in (*calls, *choices, *(f"a, b = {values}" for values in beside), *targets):
         assert len(folded(line)) == 1, line
-    alike_values = ("0, 0", "-1, 2**23 / 3", "[], [1]", "'a', 'b'", "None, None", "x + 1, y[0]", "(x, 0), (y, 1)")
-    same_function = (
-        "a, b = f(x), f(y)",
-        "low, high = x.min(), x.max()",
-        "a, b = b, a",
-        "a, b = f(x)",
-        "a = f(x), g(y)",
-    )
-    for line in (*same_function, *(f"a, b = {values}" for values in alike_values)):
+    alike_values = ("0, 0", "-1, 2 * 3", "0.5, 2 / 3", "[], [1]", "'a', 'b'", "None, None", "(x, 0), (y, 1)")
+    alike_values += ("x[0], x[1]", "x[i], y[i]", "x + 1, y * z", "f(x), f(y)", "x.min(), x.max()")
+    whole = ("a, b = b, a", "a[i], a[j] = a[j], a[i]", "a, b = f(x)", "a, self.b = f(x)", "a, b = x.shape", "a = x, y")
+    for line in (*whole, *(f"a, b = {values}" for values in alike_values)):
         assert not folded(line), line
 
 
 @pytest.mark.parametrize("path", MODULE_FILES, ids=lambda path: path.relative_to(ROOT).as_posix())
 def test_each_line_says_one_thing(path):
-    assert not folded(path.read_text(encoding="utf-8")), f"one assignment a line; a noun in place of {NO_NOUNS}"
+    assert not folded(path.read_text(encoding="utf-8")), "one assignment a line"
+
+
+def without_nouns(source: str) -> list[str]:
+    """The uses of names that do not say what they hold."""
+    names = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.arg | ast.Name)]
+    called = [(node.lineno, node.arg if isinstance(node, ast.arg) else node.id) for node in names]
+    return [f"{line}: {name}" for line, name in called if name in NO_NOUNS]
+
+
+def test_names_without_nouns_are_seen():
+    for line in ("found = 1", "a = found", "def f(ways): 0", "[found for found in x]"):
+        assert without_nouns(line), line
+    assert not without_nouns("'found'\nx.found\nfound_at = 1")
+
+
+@pytest.mark.parametrize("path", [*MODULE_FILES, *BENCHMARKS], ids=lambda path: path.relative_to(REPOSITORY).as_posix())
+def test_names_are_nouns(path):
+    """In the package and in the benchmarks; tests may call what they find so."""
+    assert not without_nouns(path.read_text(encoding="utf-8")), f"a noun in place of {NO_NOUNS}"
 
 
 # Pronouns for which a reader must look back, and private words that the field's terms have replaced; the names of old
@@ -289,16 +324,21 @@ def test_lines_of_the_core_are_short():
     assert not [f"{path}:{number}" for path, number, line in lines if len(line) > 120 or line.startswith("*")]
 
 
-# The prefix of the functions of a C file, where it is not the first word of the name of the file.
+# The first words of the names of functions in a C file or a header, where it is not the first word of the file's name.
 C_FAMILIES = {
+    "arguments": ("argument", "call", "check"),
     "attention_block": ("block",),
     "coarsen": ("octree",),
     "elastic_stiffness": ("stiffness",),
+    "fps_scan": ("FPS",),
     "pairs": ("octree",),
+    "row_tile": ("row", "column"),
     "segment": ("segment", "column"),
     "sparse_conv": ("conv",),
     "sparse_conv_weight": ("conv",),
+    "weight_panels": ("dense",),
 }
+C_WORDS = {"integers", "simd"}  # arithmetic of whole numbers and of vectors, for all kernels
 C_FUNCTION = re.compile(r"^(?:static|AST_INLINE)\b[^;=\n]*?\b(\w+)\((?!\()", re.M)
 
 
@@ -309,13 +349,16 @@ def without_prefix(stem: str, source: str) -> list[str]:
 
 
 def test_functions_of_the_core_carry_the_prefix_of_their_family():
-    """All kernels are one translation unit, in which their names meet."""
+    """All kernels are one translation unit, and so is the module; their names meet there, those of headers, too. What
+    the module does for a kernel has the name of that kernel, or of `call`, or of the attention block."""
     source = "static void pop(stack *s) {\nAST_INLINE vf fps_near(vf x) {\nstatic char *fps_at(void) { f(g); }\n"
     assert without_prefix("fps", source) == ["pop"]
     kernels = set(re.findall(r"KERNEL\((\w+)\)", (REPOSITORY / "csrc" / "ast.h").read_text(encoding="utf-8")))
-    files = sorted((REPOSITORY / "csrc").glob("*.c"))
-    bad = {path.name: set(without_prefix(path.stem, path.read_text(encoding="utf-8"))) - kernels for path in files}
-    assert len(files) > 30 and not {name: functions for name, functions in bad.items() if functions}
+    for_kernels = {"call", "block", *(name.split("_")[0] for name in kernels)}
+    files = sorted(path for path in (REPOSITORY / "csrc").glob("*.[ch]") if path.stem not in C_WORDS)
+    names = {path.name: set(without_prefix(path.stem, path.read_text(encoding="utf-8"))) - kernels for path in files}
+    names["module_kernels.h"] = {name for name in names["module_kernels.h"] if name.split("_")[0] not in for_kernels}
+    assert len(files) > 45 and not {name: functions for name, functions in names.items() if functions}
 
 
 if __name__ == "__main__":

@@ -106,7 +106,8 @@ class Batch:
 
     def placed(self, placement: Placement) -> Batch:
         """The same scene, mirrored and moved."""
-        previous, source = self.previous_position, self.source
+        previous = self.previous_position
+        source = self.source
         return replace(
             self,
             graph=self.graph.placed(placement),

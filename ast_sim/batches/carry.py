@@ -107,7 +107,8 @@ def harmonic_extension(scene: Scene, held: np.ndarray, free: np.ndarray) -> Call
     low = np.minimum(one, other)
     high = np.maximum(one, other)
     diagonal = np.bincount(np.concatenate([low, high]), np.tile(-integrals, 2), minlength=count)[:count]
-    inner, outer = high < count, (low < count) & (high >= count)
+    inner = high < count
+    outer = (low < count) & (high >= count)
     width = 1 + int((high - low)[inner].max(initial=0))
     diagonal += LOOSE * diagonal.max(initial=np.finfo(float).tiny)
     upper = low[inner], high[inner], integrals[inner]

@@ -86,7 +86,8 @@ class Graph:
             surface: the graph has the surface.
             elastic: the material of its tetrahedra; the graph has their elasticity.
         """
-        n, e = scene.num_nodes, scene.num_elements
+        n = scene.num_nodes
+        e = scene.num_elements
         elements = torch.from_numpy(scene.elements.astype("int64"))
         rest = torch.tensor(scene.rest_position)
         node_type = torch.from_numpy(scene.node_type.astype("int64"))

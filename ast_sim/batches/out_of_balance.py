@@ -62,7 +62,8 @@ class ElasticTetrahedra:
         if material.law is not None:
             given, ratio = (np.full(count, material.numbers(name, scene.material), np.float32) for name in ELASTIC)
             if (given > 0).all() and (ratio >= 0).all() and (ratio < 0.5).all():
-                young, poisson = given, ratio
+                young = given
+                poisson = ratio
         young = young * scene.deforming_elements
         lame = np.stack([young * poisson / ((1 + poisson) * (1 - 2 * poisson)), young / (2 * (1 + poisson))], axis=1)
         lame = torch.from_numpy(lame)

@@ -145,17 +145,21 @@ class PairSampler:
         fields: tuple[tuple[str, str, int, str], ...] = (),
         scenes: int | None = None,
     ) -> None:
-        self.batch_size, self.seed, self.noise = batch_size, seed, noise
+        self.batch_size = batch_size
+        self.seed = seed
+        self.noise = noise
         self.left = np.float32(1 - gamma)  # share of the noise that stays in the target
-        self._dataset, self._split, self.part = dataset, split, part
-        self._make_graph, self._fields = make_graph, fields
+        self._dataset = dataset
+        self._split = split
+        self.part = part
+        self._make_graph = make_graph
+        self._fields = fields
         self.scheme = scheme
         self.first_frame = scheme.given_frames - 1  # the least t of a pair
         self._mirrored = np.array([axis in mirror for axis in "xyz"])
         self._shift = np.float32(shift)
         require_whole_motions(dataset, split)
-        chosen = range(dataset.count(split))[:scenes]
-        frames = np.array([dataset.num_frames(split, i) for i in chosen], np.int64)
+        frames = np.array([dataset.num_frames(split, i) for i in range(dataset.count(split))[:scenes]], np.int64)
         self._starts = np.concatenate([[0], np.cumsum(np.maximum(frames - 1 - self.first_frame, 0))])
         if self.num_pairs == 0:
             least = f"at least {2 + self.first_frame} frames"
@@ -215,9 +219,8 @@ class PairSampler:
     def places(self, step: int) -> range:
         """The places of this part of a step's batch in the endless sequence of epochs."""
         index, count = self.part
-        size = self.batch_size // count
-        first = step * self.batch_size + index * size
-        return range(first, first + size)
+        first = step * self.batch_size + index * (self.batch_size // count)
+        return range(first, first + self.batch_size // count)
 
     def _pair(self, epoch: int, number: int) -> Pair | Jump:
         """Pair `number` of all, with its noise and its placement in an epoch."""
@@ -264,7 +267,6 @@ class PairSampler:
         """The batch of one pair, mirrored and moved."""
         member = self._member(pair.index)
         jumps = isinstance(pair, Jump)
-        name = f"{self._split}/{pair.index:06d}"
         source, frame = (pair.source, pair.frame) if jumps else (pair.t, pair.t + 1)
         before, stress = self._dataset.frames(self._split, pair.index, source - self.first_frame, source + 1)
         if jumps and pair.source_error is not None:
@@ -279,16 +281,15 @@ class PairSampler:
             history = member.graph.at_nodes(self.scheme.history, known)
             state = replace(state, source=torch.tensor(before[-1]), history=history)
         target = Target(torch.from_numpy(motion), self._values(member, next_stress, 0, frame))
-        names = [f"{name} frame {frame if jumps else source}"]
+        names = [f"{self._split}/{pair.index:06d} frame {frame if jumps else source}"]
         batch = Batch.build(member.graph, state, torch.tensor(after), names)
         return batch.placed(pair.placement), target.placed(pair.placement)
 
     def _values(self, member: _Member, stress: np.ndarray | None, row: int, frame: int) -> dict[str, Tensor]:
         """What is predicted beside the motion, [N or E, *] by name, in a frame, whose stress is in this row."""
-        values = {} if stress is None else {STRESS: torch.tensor(stress[row])}
-        for (key, *_), field in zip(self._fields, member.fields, strict=True):
-            values[key] = torch.tensor(field[frame])
-        return values
+        rows = zip(self._fields, member.fields, strict=True)
+        values = {key: torch.tensor(field[frame]) for (key, *_), field in rows}
+        return values if stress is None else {STRESS: torch.tensor(stress[row]), **values}
 
     def _jump(self, jump: Jump, member: _Member, before: np.ndarray, after: np.ndarray) -> _Motion:
         if jump.error is not None:
@@ -318,8 +319,7 @@ class PairSampler:
     def random_placement(self, index: int, generator: np.random.Generator) -> Placement:
         """Mirrored along each axis of `mirror` with probability 1/2, and moved by at most `shift`."""
         member = self._member(index)
-        drawn = generator.integers(2, size=3, dtype=bool)
-        sign = np.where(drawn & self._mirrored, np.float32(-1), np.float32(1))
+        sign = np.where(generator.integers(2, size=3, dtype=bool) & self._mirrored, np.float32(-1), np.float32(1))
         shift = generator.uniform(-1, 1, 3).astype(np.float32) * self._shift * member.noisy.max(axis=0)
         return Placement(sign, member.center, shift)
 

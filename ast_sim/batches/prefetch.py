@@ -23,7 +23,8 @@ class Ahead:
     def __init__(
         self, sampler: PairSampler | TrainingPool, prepare: Callable[[Batch], Batch] = lambda batch: batch
     ) -> None:
-        self._sampler, self._prepare = sampler, prepare
+        self._sampler = sampler
+        self._prepare = prepare
         self._thread = ThreadPoolExecutor(1, "sampler")
         self._next: dict[int, Future[tuple[Batch, Target]]] = {}
 

@@ -113,7 +113,8 @@ class JumpPool(TrainingPool[_Guess]):
         return scene
 
     def _goes_on(self, scene: _Guess, error: np.ndarray) -> bool:
-        scene.call, scene.error = scene.call + 1, error
+        scene.call = scene.call + 1
+        scene.error = error
         if self._is_too_large(error):
             return False
         if scene.call == scene.last and scene.then is not None:

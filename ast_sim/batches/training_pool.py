@@ -45,7 +45,9 @@ class TrainingPool(ABC, Generic[S]):
     weighs = False  # whether some scenes count more than others
 
     def __init__(self, sampler: PairSampler, size: int, largest: float) -> None:
-        self._sampler, self._size, self._batches = sampler, size, size // sampler.batch_size
+        self._sampler = sampler
+        self._size = size
+        self._batches = size // sampler.batch_size
         self._largest = largest
         self._begun: dict[int, int] = {}
         self._going: dict[int, S] = {}
@@ -120,7 +122,8 @@ class TrainingPool(ABC, Generic[S]):
 
     def _drawn(self, place: int) -> S:
         """The last scene that started at a place, as it was at the start."""
-        sampler, begun = self._sampler, self._begun[place]
+        sampler = self._sampler
+        begun = self._begun[place]
         order, draws = self.streams
         epoch, number = divmod((begun - 1) * self._size + place, len(sampler.trajectories))
         index = int(sampler.random(order, epoch).permutation(sampler.trajectories)[number])

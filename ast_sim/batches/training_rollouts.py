@@ -65,7 +65,8 @@ class RolloutPool(TrainingPool[_Rolling]):
     def _frames(self, place: int, scene: _Rolling) -> Pair:
         generator = self._sampler.random(_NOISE, place, self._begun[place], scene.t)
         white = self._sampler.white_noise(scene.index, generator)
-        error, after = white, self._sampler.left * white
+        error = white
+        after = self._sampler.left * white
         if scene.error is not None:
             led_back = self._led_back(scene.error, scene.error_before)
             error, after = scene.error + white * SHARE, after * SHARE + led_back

@@ -18,7 +18,9 @@ class Split(Sequence[Trajectory]):
     """The trajectories of a dataset's split, in order; each is read on access. A slice of a split is a `Split`, too."""
 
     def __init__(self, dataset: Dataset, name: str, indices: range) -> None:
-        self._dataset, self.name, self._indices = dataset, name, indices
+        self._dataset = dataset
+        self.name = name
+        self._indices = indices
 
     def _facts(self) -> dict[str, str]:
         return {"name": self.name, "scenes": f"{len(self):,}", "file": self._dataset.path.name}

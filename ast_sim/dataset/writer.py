@@ -188,7 +188,8 @@ class FittedWriter(DatasetWriter):
 
     def __init__(self, path: str | os.PathLike[str], **facts: Any) -> None:
         super().__init__(path, DatasetInfo(domain_center=(0.0, 0.0, 0.0), domain_half_width=1.0, **facts))
-        self._lowest, self._highest = np.full(3, np.inf), np.full(3, -np.inf)
+        self._lowest = np.full(3, np.inf)
+        self._highest = np.full(3, -np.inf)
 
     def add(self, split: str, trajectory: Trajectory) -> None:
         super().add(split, trajectory)

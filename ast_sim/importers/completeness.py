@@ -45,7 +45,8 @@ def require_complete(source: Path, trajectory: Trajectory, names: FieldNames) ->
 
 
 def _missing(trajectory: Trajectory) -> list[str]:
-    scene, position = trajectory.scene, trajectory.position
+    scene = trajectory.scene
+    position = trajectory.position
     largest = _STILL * np.ptp(position[0], axis=0).max()
     moves = (np.ptp(position, axis=0) > largest).any(axis=1)
     missing = []

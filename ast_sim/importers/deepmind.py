@@ -123,7 +123,9 @@ class _Record:
     """A trajectory as it is stored; `where` is the file and the record, for messages."""
 
     def __init__(self, payload: bytes, meta: Meta, where: str) -> None:
-        self.payload, self.meta, self.where = payload, meta, where
+        self.payload = payload
+        self.meta = meta
+        self.where = where
         counts = [LENGTH + name for name, feature in meta.features.items() if feature.kind == "dynamic_varlen"]
         self.spans = find_values(payload, [*meta.features, *counts], where)
         for name in (*meta.features, *counts):
@@ -143,7 +145,8 @@ class _Record:
 
     def frames(self, name: str) -> np.ndarray:
         """A feature as [T, rows, columns]; a static one as [1, rows, columns]."""
-        feature, length = self.meta.features[name], self.meta.trajectory_length
+        feature = self.meta.features[name]
+        length = self.meta.trajectory_length
         array = self.array(name, feature.shape, feature.dtype)
         if feature.kind != "dynamic_varlen":
             return array

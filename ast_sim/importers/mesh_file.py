@@ -254,7 +254,10 @@ def mesh_of(mesh: SourceMesh, stitching: Stitching, corners: bool = False) -> Me
     everyone = np.arange(len(mesh.points))
     shells, rows = _shells(mesh, point_of, taken)
     notes += _told_of_cells(mesh, taken, rows) + taken.notes + told
-    points, elements, node_rows, element_rows = mesh.points, taken.nodes, everyone, taken.rows
+    points = mesh.points
+    elements = taken.nodes
+    node_rows = everyone
+    element_rows = taken.rows
     if shells is not None:
         points = np.concatenate([points, shells.behind(points)])
         elements = np.concatenate([elements, shells.tetrahedra(points)])

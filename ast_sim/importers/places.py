@@ -54,7 +54,9 @@ class Rule(NamedTuple):
             return {"field": field, "group": group}[self.kind](self.name)
         if self.kind == "all":
             return np.ones(len(points), bool)
-        x, tolerance, limit = points[:, self.axis], _SAME * np.ptp(points, axis=0).max(), self.limit
+        x = points[:, self.axis]
+        tolerance = _SAME * np.ptp(points, axis=0).max()
+        limit = self.limit
         at_end = max(tolerance, _FLAT_END * shortest)
         return {
             "min": x <= x.min() + at_end,

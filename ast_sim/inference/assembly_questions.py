@@ -15,6 +15,7 @@ from ast_sim.prescribed_motion import Motion
 from ast_sim.runs.scope import Scope
 from ast_sim.scene import Scene
 from ast_sim.simulate.families.assembly import scene_of
+from ast_sim.simulate.own_assembly.grid import required_values
 from ast_sim.simulate.own_assembly.parameters import Values, completed, recorded
 from ast_sim.simulate.own_assembly.spec_reader import read_spec
 from ast_sim.simulate.own_assembly.standing import reference
@@ -95,3 +96,17 @@ def ask(
     for note in notes:
         warn(note)
     return questions
+
+
+def one_question(
+    spec: str | os.PathLike[str],
+    parameters: Mapping[str, Any] | None,
+    scope: Scope,
+    trained: Mapping[str, Any] | None,
+    frames: int | None,
+    nodes: int | None,
+) -> AssemblyQuestion:
+    """The scene with these values of the parameters; None: all are in the middle of their ranges. As `ask`."""
+    values = {} if parameters is None else required_values("parameters", parameters)
+    (question,) = ask(spec, [values], scope, trained, frames, nodes)
+    return question

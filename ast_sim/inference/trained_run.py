@@ -15,7 +15,7 @@ from ast_sim.dataset.reader import Dataset
 from ast_sim.importers.scene_mesh import SceneMesh
 from ast_sim.inference.answer import Answer
 from ast_sim.inference.answering import doubts, in_domain
-from ast_sim.inference.assembly_questions import ask
+from ast_sim.inference.assembly_questions import one_question
 from ast_sim.inference.effort import DefaultEffort, Effort, error_with
 from ast_sim.inference.evaluation import SOLVER_SCENES
 from ast_sim.inference.evaluation.evaluate import evaluate
@@ -29,7 +29,7 @@ from ast_sim.inference.sweep import Sweep, sweep
 from ast_sim.number_arrays import percent
 from ast_sim.runs import run_file
 from ast_sim.scene import Scene, Trajectory
-from ast_sim.simulate.own_assembly.grid import required_values, rows_of
+from ast_sim.simulate.own_assembly.grid import rows_of
 from ast_sim.support.argument_checks import file_name, require_bool, require_type, several
 from ast_sim.support.errors import ConfigError, RolloutError, warn
 from ast_sim.support.notebook_table import html_bars, html_table, one_line
@@ -63,7 +63,8 @@ class Run:
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = file_name(path, "path")
         self.folder = run_file.open_run(self.path)
-        self.settings, self.scope = self.folder.settings, self.folder.scope
+        self.settings = self.folder.settings
+        self.scope = self.folder.scope
         self.model = self.folder.load_model()
         _, self.step, answers = self.folder.chosen
         corrections = self.settings.train.corrections
@@ -108,7 +109,8 @@ class Run:
     @property
     def info(self) -> DatasetInfo:
         """The units and the kind of the predictions, and the names of their material."""
-        model, scope = self.settings.model, self.scope
+        model = self.settings.model
+        scope = self.scope
         return DatasetInfo(
             family=scope.family,
             integration=model.data.integration,
@@ -145,8 +147,7 @@ class Run:
         their ranges in training, of Newton steps that have not converged, and of changes of the specification.
 
         Args:
-            scene: a scene, with lengths in the run's unit, or what `read_scene` returns. Or a `Trajectory`, which has
-                motion and start of its own: then leave motion, num_frames and stress out.
+            scene: in the run's unit, as of `read_scene`; or a `Trajectory`, which has its motion, frames and stress.
             motion: of the prescribed nodes: rigid motions by body, such as {1: (0, 0, -0.01)}; or positions [S, N, 3]
                 of all nodes or [S, P, 3] of the prescribed ones; or a `Motion`.
             spec, parameters, nodes: instead of a scene and a motion, the specification of an assembly, values of its
@@ -167,19 +168,20 @@ class Run:
             RolloutError: there is no such frame; or the prediction failed: the error's `answer` has the frames before.
         """
         began = time.perf_counter()
-        facts: Mapping[str, Any] = NOTHING
-        notes: tuple[str, ...] = ()
+        built = None
         if spec is not None:
             if not (scene is None and motion is None and stress is None):
                 raise ConfigError("a specification gives the scene and the motion: leave scene, motion and stress out")
-            values = {} if parameters is None else required_values("parameters", parameters)
-            (built,) = ask(spec, [values], self.scope, self.folder.specification, num_frames, nodes)
-            scene, motion, facts, notes = built.scene, built.motion, built.facts, built.notes
+            built = one_question(spec, parameters, self.scope, self.folder.specification, num_frames, nodes)
+            scene = built.scene
+            motion = built.motion
             num_frames = None
         elif parameters is not None or nodes is not None or scene is None:
             raise ConfigError("give a scene, or a specification with its parameters and nodes")
+        notes = built.notes if built else ()
         question = new_question(self.settings.model, self.scope, scene, motion, num_frames, name, frames, stress, notes)
         chosen, promises = chosen_effort(self, [question], effort, error, ms)
+        facts = built.facts if built else NOTHING
         return self._answers([question], chosen, began, throw, [{**facts, **promises[0]}], progress)[0]
 
     def sweep(
@@ -208,7 +210,8 @@ class Run:
         """
         rows = rows_of(parameters, table)
         chosen, _ = chosen_effort(self, [], effort, error)
-        model, trained = self.settings.model, self.folder.specification
+        model = self.settings.model
+        trained = self.folder.specification
         return sweep(self.predict_scenes, model, self.scope, trained, spec, rows, chosen, error, nodes, progress)
 
     def predict_scenes(
@@ -226,10 +229,9 @@ class Run:
         """Predict several scenes, each under a motion, as one batch. `progress` is as in `generate`; errors and other
         arguments are as in `predict`."""
         began = time.perf_counter()
-        config, scope = self.settings.model, self.scope
         frames = list(frames) if isinstance(frames, Iterator) else frames  # it gives its numbers once
         questions = [
-            new_question(config, scope, scene, motion, num_frames, name, frames)
+            new_question(self.settings.model, self.scope, scene, motion, num_frames, name, frames)
             for scene, motion, name in scenes_of(scenes, names)
         ]
         chosen, promises = chosen_effort(self, questions, effort, error)

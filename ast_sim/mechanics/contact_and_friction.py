@@ -225,14 +225,13 @@ class Contact:
         2020, section 5). States that are made after this call contain the friction; earlier states do not.
         """
         pairs = self._ipctk.TangentialCollisions()
-        stiffness, friction = self.settings.stiffness, self.settings.friction
-        arguments = self._mesh, state.vertices, state.collisions, self.barrier, stiffness
+        arguments = self._mesh, state.vertices, state.collisions, self.barrier, self.settings.stiffness
         if self.settings.pair_friction:
             between = functools.cache(self.settings.friction_between)
             # ipctk blends the coefficients of two vertices; here they are numbers of bodies.
             pairs.build(*arguments, self._body, self._body, lambda a, b: between(round(a), round(b)))
         else:
-            pairs.build(*arguments, friction)
+            pairs.build(*arguments, self.settings.friction)
         self._sliding = pairs, self._vertices(start)
 
     def _new_collisions(self):
@@ -274,7 +273,9 @@ class ContactState:
     """
 
     def __init__(self, contact: Contact, collisions, vertices: np.ndarray) -> None:
-        self._contact, self.collisions, self.vertices = contact, collisions, vertices
+        self._contact = contact
+        self.collisions = collisions
+        self.vertices = vertices
         self._sliding = contact._sliding
 
     @property
@@ -286,8 +287,8 @@ class ContactState:
         """Barrier energy and the lagged potential of friction, in joule."""
         if self._sliding is None:
             return self.barrier_energy()
-        contact, (pairs, start) = self._contact, self._sliding
-        energy = contact._friction(pairs, contact._mesh, self.vertices - start)
+        contact = self._contact
+        energy = contact._friction(self._sliding[0], contact._mesh, self.vertices - self._sliding[1])
         return self.barrier_energy() + energy / contact._zoom**3
 
     def barrier_energy(self) -> float:
@@ -314,8 +315,8 @@ class ContactState:
         """Derivative of the potential of friction by the positions of the surface nodes [V,3], in newton."""
         if self._sliding is None:
             return np.zeros(self.vertices.shape)
-        contact, (pairs, start) = self._contact, self._sliding
-        gradient = contact._friction.gradient(pairs, contact._mesh, self.vertices - start)
+        contact = self._contact
+        gradient = contact._friction.gradient(self._sliding[0], contact._mesh, self.vertices - self._sliding[1])
         return gradient.reshape(-1, 3) / contact._zoom**2
 
     def gradient(self) -> np.ndarray:
@@ -332,19 +333,18 @@ class ContactState:
             project: make each pair's block positive semi-definite.
         """
         contact = self._contact
-        method = contact._ipctk.PSDProjectionMethod
-        method = method.CLAMP if project else method.NONE
+        methods = contact._ipctk.PSDProjectionMethod
+        method = methods.CLAMP if project else methods.NONE
         parts = []
         if not self.collisions.empty():
             barrier = contact.barrier.hessian(self.collisions, contact._mesh, self.vertices, method)
-            parts.append((barrier, contact.settings.stiffness))
+            parts.append((barrier.tocoo(), contact.settings.stiffness))
         if self._sliding is not None:
             pairs, start = self._sliding
-            parts.append((contact._friction.hessian(pairs, contact._mesh, self.vertices - start, method), 1.0))
+            parts.append((contact._friction.hessian(pairs, contact._mesh, self.vertices - start, method).tocoo(), 1.0))
         if not parts:
             return np.zeros(0, int), np.zeros(0, int), np.zeros(0)
-        local = [(matrix.tocoo(), scale) for matrix, scale in parts]
-        rows = np.concatenate([matrix.row for matrix, _ in local])
-        columns = np.concatenate([matrix.col for matrix, _ in local])
-        values = np.concatenate([scale * matrix.data for matrix, scale in local]) / contact._zoom
+        rows = np.concatenate([matrix.row for matrix, _ in parts])
+        columns = np.concatenate([matrix.col for matrix, _ in parts])
+        values = np.concatenate([scale * matrix.data for matrix, scale in parts]) / contact._zoom
         return contact._dofs[rows], contact._dofs[columns], values

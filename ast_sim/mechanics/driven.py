@@ -63,7 +63,8 @@ class Driven:
         travel[scene.prescribed] = np.abs(given - given[0]).max(axis=(0, 2))
         farthest = int(np.argmax(travel))
         body = int(scene.body[farthest])
-        own, moves = scene.prescribed & (scene.body == body), travel > RIGID * travel[farthest]
+        own = scene.prescribed & (scene.body == body)
+        moves = travel > RIGID * travel[farthest]
         if not scene.deforming_nodes[farthest] or not moves.any():
             nodes = own
         else:

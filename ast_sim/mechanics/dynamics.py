@@ -227,7 +227,8 @@ class ClothFrames(Frames[DynamicRecord]):
 
     def next_frame(self) -> tuple[dict[str, np.ndarray], DynamicRecord]:
         """See `Frames`."""
-        solver, start = self.solver, self.solver.position
+        solver = self.solver
+        start = self.solver.position
         cost = self.advance()
         arrays = {"position": solver.position.astype(np.float32)}
         checked = self.check(arrays)

@@ -130,7 +130,9 @@ class Frames(ABC, Generic[R]):
     record_type: type[R]
 
     def __init__(self, case: Case, solver: Solver, contact: Contact) -> None:
-        self.case, self.solver, self.contact = case, solver, contact
+        self.case = case
+        self.solver = solver
+        self.contact = contact
         self.records: list[R] = []
         self.arrays: dict[str, list[np.ndarray]] = {}
         self._steps_before = 0
@@ -220,7 +222,9 @@ class Frames(ABC, Generic[R]):
         """Solve for the next frame; the first frame is where the solver stands."""
         solver = self.solver
         started = process_time()
-        steps, factorizations, halvings = solver.iterations, solver.factorizations, solver.halvings
+        steps = solver.iterations
+        factorizations = solver.factorizations
+        halvings = solver.halvings
         dissipation = solver.dissipation
         self._steps_before = steps
         if self.records:

@@ -100,7 +100,8 @@ class QuasiStatic:
 
     def _advance_damped(self, goal: np.ndarray, reason: str) -> None:
         """Take steps of backward Euler from rest, each with less inertia, until there is equilibrium without any."""
-        newton, elasticity = self.newton, self.elasticity
+        newton = self.newton
+        elasticity = self.elasticity
         volume = elasticity.lumped_volume()
         if self._damped is None:
             self._damped = Newton(self._inertia, newton.contact, newton.prescribed, newton.position, newton.settings)
@@ -110,7 +111,8 @@ class QuasiStatic:
         self._damped.watch = newton.watch
         self._damped.restart(newton.position)
         for _ in range(MAX_DAMPED_STEPS):
-            self._inertia.weight, self._inertia.predicted = weight, self._damped.position
+            self._inertia.weight = weight
+            self._inertia.predicted = self._damped.position
             before = self._damped.position
             try:
                 self._damped.step(goal)

@@ -173,7 +173,9 @@ class SolidFrames(Frames[SolidRecord]):
             self._reactions = self._held()
         arrays = self._stored()
         checked = self.check(arrays)
-        reactions, nodes, axis = self._reactions, self.driven.nodes, self.driven.axis
+        reactions = self._reactions
+        nodes = self.driven.nodes
+        axis = self.driven.axis
         turned = {} if axis is None else {"torque": axis.torque(newton.position[nodes], reactions[nodes])}
         return arrays, self.record_type(
             **cost,
@@ -191,7 +193,8 @@ class SolidFrames(Frames[SolidRecord]):
     def bring(self, frame: int) -> None:
         """See `Frames`. The work of a leg follows by the trapezoidal rule."""
         for leg in self.case.legs(frame):
-            start, self._steps_before = self.solver.newton.position, self.solver.iterations
+            start = self.solver.newton.position
+            self._steps_before = self.solver.iterations
             self.solver.advance(leg.end, along=leg.along)
             reactions = self._held()
             self._work += 0.5 * float(np.vdot(reactions + self._reactions, self.solver.newton.position - start))
@@ -203,7 +206,8 @@ class SolidFrames(Frames[SolidRecord]):
 
     def _stored(self) -> dict[str, np.ndarray]:
         """The arrays of a frame as they are stored."""
-        elasticity, deformation = self._elasticity, self.solver.newton.state.potential
+        elasticity = self._elasticity
+        deformation = self.solver.newton.state.potential
         common = {
             "position": self.solver.newton.position.astype(np.float32),
             REACTION: self._reactions.astype(np.float32),

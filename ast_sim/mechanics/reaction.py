@@ -147,7 +147,8 @@ class Reaction:
                     continue
                 square = np.asarray(igl.point_mesh_squared_distance(position[nodes], position[used], local)[0])
                 closer = square < nearest[nodes]
-                nearest_body[nodes[closer]], nearest[nodes[closer]] = body, square[closer]
+                nearest_body[nodes[closer]] = body
+                nearest[nodes[closer]] = square[closer]
         return nearest_body
 
     def _folds(self, position: np.ndarray) -> np.ndarray:

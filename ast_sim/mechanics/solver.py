@@ -123,10 +123,13 @@ class Newton:
         settings: SolverSettings | None = None,
         system: LinearSystem | None = None,
     ) -> None:
-        self.potential, self.contact, self.prescribed = potential, contact, prescribed
+        self.potential = potential
+        self.contact = contact
+        self.prescribed = prescribed
         self.settings = settings or SolverSettings()
         self.system = system or LinearSystem(potential.entries(), prescribed)
-        self.iterations, self.dissipation = 0, 0.0
+        self.iterations = 0
+        self.dissipation = 0.0
         self.watch: Callable[[], None] = lambda: None
         self.restart(position)
 

@@ -74,7 +74,8 @@ class MessagePassingBlock(nn.Module):
 
     def __init__(self, config: BSMSConfig):
         super().__init__()
-        self.mesh, self.contact = EdgeMessages(config, 8), EdgeMessages(config, 4)
+        self.mesh = EdgeMessages(config, 8)
+        self.contact = EdgeMessages(config, 4)
         self.node = DeepMLP(config, 3 * config.hidden, norm=PlainNorm)
 
     def forward(self, x: Tensor, mesh: Edges, contacts: Edges) -> Tensor:
@@ -98,7 +99,8 @@ class BSMS(WorldEdgeSimulator[BSMSConfig]):
     def graph(self, scene: Scene) -> Graph:
         """See `Simulator`. `own` is the hierarchy of meshes."""
         graph = super().graph(scene)
-        edges, prescribed = graph.edges, graph.prescribed
+        edges = graph.edges
+        prescribed = graph.prescribed
         if not self.config.prescribed_edges:
             edges = subset(edges, ~(prescribed[edges.senders] & prescribed[edges.receivers]))
         own = build_hierarchy(edges, graph.rest_position, self.config.levels, pooled=True, mesh=graph.edges)

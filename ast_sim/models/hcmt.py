@@ -149,7 +149,8 @@ class _ChannelAttention(torch.autograd.Function):
     @staticmethod
     def forward(ctx, q, k, v, p, g, edges: EdgeSet, scale: float) -> Tensor:
         ctx.save_for_backward(q, k, v, p, g)
-        ctx.edges, ctx.scale = edges, scale
+        ctx.edges = edges
+        ctx.scale = scale
         messages = torch.empty_like(p)
         for rows in _chunks(p):
             q_e, k_e, v_e = _gather(q, k, v, edges, rows)
@@ -160,11 +161,15 @@ class _ChannelAttention(torch.autograd.Function):
     @staticmethod
     def backward(ctx, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
         (dout,) = grad_outputs
-        (q, k, v, p, g), edges, scale = ctx.saved_tensors, ctx.edges, ctx.scale
+        q, k, v, p, g = ctx.saved_tensors
+        edges = ctx.edges
+        scale = ctx.scale
         dq, dk, dv, dp, dg = (torch.empty_like(p) for _ in range(5))  # one row for each edge
         for rows in _chunks(p):
             q_e, k_e, v_e = _gather(q, k, v, edges, rows)
-            kq, p_e, g_e = k_e * q_e, p[rows], g[rows]
+            kq = k_e * q_e
+            p_e = p[rows]
+            g_e = g[rows]
             score = (kq * p_e).mul_(scale)
             inside = score.abs().le_(LIMIT)
             dmessage = dout.index_select(0, edges.receivers[rows]).mul_(score.clamp_(-LIMIT, LIMIT).exp_())

@@ -51,7 +51,8 @@ class GraphNetBlock(nn.Module):
 
     def __init__(self, config: MGNConfig):
         super().__init__()
-        self.mesh, self.world = EdgeUpdate(config), EdgeUpdate(config)
+        self.mesh = EdgeUpdate(config)
+        self.world = EdgeUpdate(config)
         self.node = DeepMLP(config, 3 * config.hidden)
 
     def forward(self, nodes: Tensor, mesh: Edges, world: Edges) -> tuple[Tensor, Tensor, Tensor]:

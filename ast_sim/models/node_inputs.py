@@ -65,7 +65,8 @@ def with_proximity(config: ModelConfig, batch: Batch) -> Batch:
 def _proximity(batch: Batch, radius: float) -> Tensor:
     """[N, 5]: `proximity` with the prescribed nodes at their next positions and the others at their current ones. So
     it tells whether contact begins in the next frame."""
-    graph, motion = batch.graph, batch.boundary_motion
+    graph = batch.graph
+    motion = batch.boundary_motion
     surface, surface_offsets = known(graph.surface), known(graph.surface_offsets)
     return proximity(batch.position, motion, graph.node_offsets, graph.body, surface, surface_offsets, radius)
 

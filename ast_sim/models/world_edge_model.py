@@ -95,7 +95,8 @@ class WorldEdgeSimulator(Simulator, Generic[Config]):
 
     def inputs_of(self, batch: Batch, use: Use = Normalizer.__call__) -> tuple[Tensor, list[Edges], list[Edges]]:
         """See `Simulator`: of the nodes, and the mesh edges and world edges of each mesh, the finest first."""
-        graph, now = batch.graph, batch.position
+        graph = batch.graph
+        now = batch.position
         own = graph.own
         meshes = own.meshes(now) if isinstance(own, Hierarchy) else [(graph.edges, graph.rest_edges, now)]
         on_mesh, on_world = [], []
@@ -181,7 +182,8 @@ def messages(edge_mlp: DeepMLP, edges: EdgeSet, features: Tensor, nodes: Tensor)
     width = nodes.shape[1]
     of_edge, of_sender, of_receiver = edge_mlp.first.weight.split([features.shape[1], width, width], dim=1)
     of_senders, of_receivers = linear(nodes, of_sender), linear(nodes, of_receiver, edge_mlp.first.bias)
-    rest, norm = edge_mlp.rest, edge_mlp.norm
+    rest = edge_mlp.rest
+    norm = edge_mlp.norm
     if not isinstance(rest, MLP):
         assert norm is not None  # it does not decode
         weights = (rest.weight, rest.bias, norm.weight, norm.bias)

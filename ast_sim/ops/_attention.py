@@ -122,7 +122,7 @@ _SETTINGS = "q_offsets[B+1] offsets(Q), k_offsets[B+1] offsets(K), scale number,
 _OUTPUTS = "out[Q,H,D], maximum[Q,H], total[Q,H]"
 
 
-_INPUTS = f"q[Q,H,D] rows, k[K,H,D] rows, v[K,H,D] rows, {_SETTINGS}"
+_INPUTS = f"q[Q,H,D] rows_apart, k[K,H,D] rows_apart, v[K,H,D] rows_apart, {_SETTINGS}"
 _attention = Op(Kernel("attention", f"{_INPUTS} -> {_OUTPUTS}", _check_heads), _reference)
 _GRADIENTS = f"{_INPUTS}, {_OUTPUTS}, dout[Q,H,D] -> dq[Q,H,D], dk[K,H,D], dv[K,H,D]"
 _attention_backward = gradient_op(_attention, Kernel("attention_backward", _GRADIENTS, _check_heads))

@@ -52,7 +52,8 @@ def _reference(
             of_others = nodes[scene] + np.flatnonzero(bodies[mine] != other)
             gaps, outward = signed_gap(ahead[of_others], ahead, of_scene[owner == other], radius)
             nearer = np.abs(gaps) < np.abs(gap[of_others])
-            gap[of_others[nearer]], normal[of_others[nearer]] = gaps[nearer], outward[nearer]
+            gap[of_others[nearer]] = gaps[nearer]
+            normal[of_others[nearer]] = outward[nearer]
     weight = 1 - np.abs(gap) / radius
     fine = np.clip(gap / (FINE * radius), -1, 1)
     columns = np.concatenate([normal * weight[:, None], (gap / radius)[:, None], fine[:, None]], axis=1)
@@ -119,5 +120,6 @@ def signed_gap(
     gap = np.full(len(points), radius)
     normal = np.zeros((len(points), 3))
     nearest = nearest_surface(points, position, triangles, radius, radius)
-    gap[nearest.rows], normal[nearest.rows] = nearest.gap, nearest.normal
+    gap[nearest.rows] = nearest.gap
+    normal[nearest.rows] = nearest.normal
     return gap, normal

@@ -25,10 +25,10 @@ SAVED = 1 << 24  # an activation's input with more elements is not kept for the 
 
 
 # What stands behind `linear` and `linear_backward` in a spec; P is O, or O/2 for "geglu".
-_INPUTS = "x[M,I] rows, weight[O,I] rows filled, bias?[O]"
-_SPEC = f"{_INPUTS}, residual?[M,P] rows added, activation integer(0,1); save switch -> out[M,P], z[M,O] if(save)"
+_INPUTS = "x[M,I] rows_apart, weight[O,I] rows_apart filled, bias?[O]"
+_SPEC = f"{_INPUTS}, residual?[M,P] rows_apart added, activation integer(0,1); save switch -> out[M,P], z[M,O] if(save)"
 _BACKWARD_SPEC = (
-    f"dout[M,P] rows late, {_INPUTS}, z?[M,O], activation integer(0,1); wanted wants(x,weight,bias)"
+    f"dout[M,P] rows_apart late, {_INPUTS}, z?[M,O], activation integer(0,1); wanted wants(x,weight,bias)"
     " -> dx[M,I] if(wanted), dweight[O,I] if(wanted), dbias[O] if(wanted)"
 )
 

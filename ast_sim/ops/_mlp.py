@@ -18,15 +18,15 @@ SAVED = 1 << 25  # hidden units and outputs with more elements are not kept for 
 
 
 _TENSORS = (
-    "x[M,I] rows, beside?[M,J] rows, weight1[H,I+J] filled, bias1?[H], weight2[O,H] filled, bias2?[O],"
+    "x[M,I] rows_apart, beside?[M,J] rows_apart, weight1[H,I+J] filled, bias1?[H], weight2[O,H] filled, bias2?[O],"
     " gamma?[O], beta?[O] with(gamma)"
 )
 _SPEC = (
-    f"{_TENSORS}, residual?[M,O] rows added; save switch"
+    f"{_TENSORS}, residual?[M,O] rows_apart added; save switch"
     " -> out[M,O], hidden[M,H] if(save), normalized[M,O] if(save,gamma), scale[M] if(save,gamma)"
 )
 _BACKWARD_SPEC = (
-    f"dout[M,O] rows late, {_TENSORS}, hidden?[M,H], normalized?[M,O], scale?[M] with(normalized);"
+    f"dout[M,O] rows_apart late, {_TENSORS}, hidden?[M,H], normalized?[M,O], scale?[M] with(normalized);"
     " wanted wants(x,beside,weight1,bias1,weight2,bias2,gamma,beta)"
     " -> dx[M,I] if(wanted), dbeside[M,J] if(wanted), dweight1[H,I+J] if(wanted), dbias1[H] if(wanted),"
     " dweight2[O,H] if(wanted), dbias2[O] if(wanted), dgamma[O] if(wanted), dbeta[O] if(wanted)"

@@ -25,7 +25,9 @@ def gradient_op(op: Op, kernel: Kernel, known: dict[str, Callable[[dict], Any]] 
         kernel: computes it in the core.
         known: for an output of the op which the kernel takes: what stands for it, or None, by all inputs and outputs.
     """
-    inputs, outputs, taken = op.spec.inputs, op.spec.outputs, kernel.spec.inputs
+    inputs = op.spec.inputs
+    outputs = op.spec.outputs
+    taken = kernel.spec.inputs
     place = {p.name: i for i, p in enumerate([*inputs, *outputs])}
     numbers = {f"d{p.name}": i for i, p in enumerate(outputs)}
     cotangents = {i: numbers[p.name] for i, p in enumerate(taken) if p.name in numbers}
@@ -65,13 +67,11 @@ def gradient_op(op: Op, kernel: Kernel, known: dict[str, Callable[[dict], Any]] 
             args[i] = _wanted(dys[output], taken[i])
         for i, which in wants.items():
             args[i] = [needed[k] for k in which] if len(which) > 1 else needed[which[0]]
-        dxs: list[Tensor | None] = [None] * len(needed)
+        dxs: list[Tensor | None] = [dys[0] if i in added and need else None for i, need in enumerate(needed)]
         if any(needed[i] for i in of_inputs):
             results = gradient(*args)
             for i, dx in zip(of_inputs, results if isinstance(results, tuple) else (results,), strict=True):
                 dxs[i] = dx if needed[i] else None
-        for i in added:
-            dxs[i] = dys[0] if needed[i] else None
         return tuple(dxs)
 
     differentiate(op, save, backward)
@@ -145,7 +145,7 @@ def differentiate(op: Op, setup_context: Callable, backward: Callable) -> None:
     torch.library.register_autograd(op.overload.name(), backward_of_some, setup_context=setup_context, lib=LIBRARY)
 
     def forward(ctx, *args):
-        output = op.kernel(*args)
+        output = op.kernel.run(*args)
         setup_context(ctx, args, output)
         return output
 

@@ -33,6 +33,7 @@ check_variables()
 BACKEND = variable("AST_SIM_BACKEND")
 
 LIBRARY = torch.library.Library("ast_sim", "DEF")
+OPS: dict[str, Op] = {}  # by name
 
 
 def _share_torch_threads() -> None:
@@ -69,10 +70,9 @@ class Kernel:
         self.name = name
         self.spec = Spec(spec)
         self.more = more
-        taken = self.spec.taken
         self._num = len(self.spec.taken)
-        self._parameters = taken + self.spec.outputs
-        self._floats = [i for i, p in enumerate(taken) if p.shape is not None and p.dtype.is_floating_point]
+        self._parameters = self.spec.taken + self.spec.outputs
+        self._floats = [i for i, p in enumerate(self.spec.taken) if p.shape is not None and p.dtype.is_floating_point]
         if BACKEND == "c":
             places = {p.name: i for i, p in enumerate(self._parameters)}
             numbers = [n for p in self._parameters for n in p.numbers(places, _C.checks.split())]
@@ -150,7 +150,7 @@ def contiguous(x: Any, p: Argument) -> Any:
     """A tensor aligned and contiguous, but for rows that may lie apart; a copy only if it is not so already."""
     if not isinstance(x, Tensor) or p.shape is None:
         return x
-    inside = x[0] if "rows" in p.words and x.dim() and len(x) and x.stride(0) >= x[0].numel() else x
+    inside = x[0] if "rows_apart" in p.words and x.dim() and len(x) and x.stride(0) >= x[0].numel() else x
     if inside.is_contiguous() and not x.data_ptr() % x.element_size() and not x.is_neg():
         return x
     return x.detach().resolve_neg().clone(memory_format=torch.contiguous_format)
@@ -172,8 +172,11 @@ class Op:
     """
 
     def __init__(self, kernel: Kernel, composition: Callable, fake: Callable | None = None) -> None:
-        self.name, self.spec, self.composition = kernel.name, kernel.spec, composition
-        self.kernel, self._outputs, self._check = kernel.run, kernel.outputs, kernel.check
+        OPS[kernel.name] = self
+        self.name = kernel.name
+        self.spec = kernel.spec
+        self.kernel = kernel
+        self.composition = composition
         self.function: type[torch.autograd.Function] | None = None  # set by `derivatives.differentiate`
         LIBRARY.define(self.name + self.spec.schema)
         LIBRARY.impl(self.name, self._on_cpu, "CPU")
@@ -199,11 +202,11 @@ class Op:
                 wants_gradient = wants_gradient or x.requires_grad
             elif kind not in _NO_TENSORS and isinstance(x, torch.Tensor):
                 return self.overload(*args)
-        if _is_watched():
+        if is_transformed() or torch.is_autocast_enabled("cpu"):  # then a mode, a transform or a tracer must see the op
             return self.overload(*args)
         if wants_gradient and self.function and torch.is_grad_enabled():
             return self.function.apply(*args)
-        return self._outputs(*args)
+        return self.kernel.outputs(*args)
 
     def reference(self, *args) -> Any:
         """The composition, after the checks. Both read what kernels read, although torch traces or somebody has
@@ -211,7 +214,7 @@ class Op:
         watched = torch._C._len_torch_dispatch_stack() > 0
         with disable_proxy_modes_tracing() if watched else nullcontext():
             args = _values_read(args)
-            self._check(*args)
+            self.kernel.check(*args)
         result = self.composition(*args)
         return Kernel.given(result, args) if isinstance(result, tuple) else result
 
@@ -222,7 +225,7 @@ class Op:
         for x in tensors:
             if x.device.type != "cpu":
                 raise ValueError(f"{self.name}: all tensors must lie on one device, found {x.device} beside cpu")
-        return self.kernel(*args)
+        return self.kernel.run(*args)
 
     def compose(self, *args) -> Any:
         """The composition, as a function that torch can differentiate and transform in every way."""
@@ -265,11 +268,6 @@ def is_transformed() -> bool:
     """Whether torch traces or transforms, so that tensors made now may have no values afterwards."""
     functorch = torch._C._are_functorch_transforms_active()
     return functorch or torch._C._len_torch_dispatch_stack() > 0 or torch._C._is_tracing()
-
-
-def _is_watched() -> bool:
-    """Whether a mode, a transform or a tracer must see the op."""
-    return is_transformed() or torch.is_autocast_enabled("cpu")
 
 
 def is_at_most(size: int, most: int) -> bool:

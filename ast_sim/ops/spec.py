@@ -1,6 +1,6 @@
 """What an op takes and gives, said once: its schema, its outputs, and the checks here and in the core follow from it.
 
-    x[M,I] rows, weight[O,I] rows filled, bias?[O], source[P] index(M), depth integer(0,21); save switch
+    x[M,I] rows_apart, weight[O,I] rows_apart filled, bias?[O], source[P] index(M), depth integer(0,21); save switch
     -> out[M,O], z[M,O] if(save)
 
 `csrc/README.md` explains the words.
@@ -53,10 +53,7 @@ class Dimension:
     def fits(self, length: int, sizes: Sizes) -> bool:
         """Whether an axis may be as long as this. A letter that stands alone binds at first sight."""
         if self.single and self.single not in sizes:
-            rest, factor = length - self.constant, self.factors[self.single]
-            if rest < 0 or rest % factor:
-                return False
-            sizes[self.single] = rest // factor
+            sizes[self.single] = max(length - self.constant, 0) // self.factors[self.single]
         return length == self.size(sizes)
 
     def show(self, sizes: Sizes) -> str:
@@ -110,22 +107,24 @@ class Argument:
 
     def numbers(self, places: dict[str, int], checks: list[str]) -> list[int]:
         """As csrc/spec.h takes it, given the place of each parameter and the names of the core's checks."""
-        kind = 0 if self.shape is not None else 3 if "bits" in self.words else 2 if "number" in self.words else 1
-        flags = (self.optional or "if" in self.words, self.output, "rows" in self.words, "filled" in self.words)
+        flags = (self.optional or "if" in self.words, self.output, "rows_apart" in self.words, "filled" in self.words)
         other = places[self.words["with"]] if "with" in self.words else -1
         mine = [word for word in self.words if word in CHECKS]
         sizes = [Dimension.of(name) for name in self.names("size")] or self.shape or ()
+        kind = 0 if self.shape is not None else max(_KINDS.get(word, 1) for word in self.words)
         numbers = [kind, _TYPES[self.dtype], *map(int, flags), *self.bounds, other, len(self.shape or ()), len(mine)]
         rows = [d.numbers() for d in sizes] + [[0] * 5] * (4 - len(sizes))
         for word in mine:
             bound, arrays = _inside(self.words[word])
-            rows.append([checks.index(word), *bound.numbers(), *([places[name] for name in arrays] + [-1, -1])[:2]])
-        return sum([numbers, *rows, *[[0] * 8] * (2 - len(mine))], [])
+            others = [*(places[name] for name in arrays), -1, -1]
+            rows.append([checks.index(word), *bound.numbers(), *others[:2]])
+        return [n for row in (numbers, *rows) for n in row] + [0] * 8 * (2 - len(mine))
 
 
 _SCHEMA = {"flag": "bool", "switch": "bool", "wants": "bool", "size": "SymInt", "integer": "int"}
 _SCHEMA |= {"number": "float", "bits": "int"}
-_WORDS = {"int64", "int32", "rows", "filled", "late", "with", "added", "if", *_SCHEMA}
+_KINDS = {"number": 2, "bits": 3}  # what is no array, as csrc/spec.h counts; 1 is a whole number
+_WORDS = {"int64", "int32", "rows_apart", "filled", "late", "with", "added", "if", *_SCHEMA}
 _COUNTED = "torch.library.get_ctx().new_dynamic_size()"  # for tracing
 _TYPES = {dtype: np.dtype(str(dtype)[6:]).num for dtype in (torch.float32, torch.int64, torch.int32)}
 
@@ -160,7 +159,8 @@ class Spec:
     def __init__(self, text: str) -> None:
         inputs, _, outputs = text.partition("->")
         taken, _, others = inputs.partition(";")
-        self.taken, self.outputs = _parameters(taken), _parameters(outputs, output=True)
+        self.taken = _parameters(taken)
+        self.outputs = _parameters(outputs, output=True)
         self.inputs = self.taken + _parameters(others)
         self.counts = _COUNTED in self._sizes().values()  # then the kernel counts the outputs, and makes them all
 
@@ -293,10 +293,9 @@ def check_index(kernel: str, name: str, index: Tensor, bound: int) -> None:
     """Raise ValueError unless all values of an index lie in [0, bound). The message names the first that does not."""
     wrong = ((index < 0) | (index >= bound)).nonzero()
     if len(wrong):
-        at = wrong[0].tolist()
+        at = tuple(wrong[0].tolist())
         place = ", ".join(map(str, at))
-        value = int(index[tuple(at)])
-        raise ValueError(f"{kernel}: {name}[{place}] = {value} is not an index below {bound}")
+        raise ValueError(f"{kernel}: {name}[{place}] = {int(index[at])} is not an index below {bound}")
 
 
 def _check_permutation(kernel: str, name: str, order: Tensor) -> None:

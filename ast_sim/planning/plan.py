@@ -63,7 +63,8 @@ class Plan:
     def __str__(self) -> str:
         longest = self.trials[-2]
         error, low, high = map(percent, self.expected)
-        minutes, scenes = self.more_minutes, self.more_scenes
+        minutes = self.more_minutes
+        scenes = self.more_scenes
         return "\n".join([
             f"take: {longest.name}",
             f"{duration(60 * self.minutes)} are {self.steps:,} steps of {measured_time(longest.seconds)}; each frame is"

@@ -44,7 +44,8 @@ _FRAMES = 5
 
 def in_trajectory(trajectory: Trajectory, dynamic: bool = False) -> list[Finding]:
     """What looks wrong in a simulation. What the bundled solver makes has nothing of it."""
-    scene, position = trajectory.scene, trajectory.position
+    scene = trajectory.scene
+    position = trajectory.position
     findings = [
         *at_rest(scene),
         *_poisson(trajectory),

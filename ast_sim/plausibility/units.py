@@ -66,7 +66,8 @@ class Stiffness(NamedTuple):
 
 def stiffness(trajectory: Trajectory) -> Stiffness | None:
     """None if there is no stress, too little strain, or a material whose modulus is not named."""
-    scene, stress = trajectory.scene, trajectory.stress
+    scene = trajectory.scene
+    stress = trajectory.stress
     columns = _columns(trajectory)
     flat = scene.elements.shape[1] == 3 and bool(np.ptp(trajectory.position[..., 2]) == 0)
     if stress is None or (scene.material is not None and YOUNG not in columns):

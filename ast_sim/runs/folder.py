@@ -50,7 +50,8 @@ class RunFolder:
 
     def keep_place(self) -> None:
         """From now on the folder is where it is today, in whatever folder this process works."""
-        self.path, self.metrics.path = self.path.absolute(), self.metrics.path.absolute()
+        self.path = self.path.absolute()
+        self.metrics.path = self.metrics.path.absolute()
 
     @cached_property
     def settings(self) -> RunConfig:
@@ -145,7 +146,8 @@ class RunFolder:
 
     def require_fit(self, dataset: Dataset) -> None:
         """Raise ConfigError unless the dataset is of the kind that the run was trained on."""
-        model, scope = self.settings.model, self.scope
+        model = self.settings.model
+        scope = self.scope
         for what, ours, theirs in (
             ("integration", model.data.integration, dataset.info.integration),
             ("stress_location", model.data.stress, dataset.info.stress_location),

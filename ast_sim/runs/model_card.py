@@ -45,7 +45,8 @@ The terms of use are in `LICENSE`.
 
 def card(name: str, settings: RunConfig, scope: Scope, chosen: Chosen, parameters: int) -> str:
     """The card as Markdown; `parameters` is their number."""
-    model, train = settings.model, settings.train
+    model = settings.model
+    train = settings.train
     training = {
         "model": f"{model.name}, {parameters:,} parameters",
         "checkpoint": f"step {chosen.step:,} of {train.steps:,}",

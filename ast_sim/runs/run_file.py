@@ -188,7 +188,8 @@ def write(path: Path, run: RunFolder, model: Simulator, effort: Mapping[str, Any
         raise CheckpointError(f"{path}: the name of a run file must end in {SUFFIX}")
     if licence is not None and not isinstance(licence, str):
         raise ConfigError(f"licence is {licence!r}; it must be the text of a licence")
-    settings, chosen = run.settings, run.chosen
+    settings = run.settings
+    chosen = run.chosen
     chosen = chosen._replace(answers={**chosen.answers, "effort": dict(effort)})
     without_path = dataclasses.replace(settings, data=Path(settings.data).name)
     facts = {

@@ -108,7 +108,9 @@ class Progress:
 
     def __init__(self, total: int, unit: str, progress: ShowProgress, done: int = 0) -> None:
         require_progress(progress)
-        self.total, self.unit, self.done = total, unit, done
+        self.total = total
+        self.unit = unit
+        self.done = done
         self.shown = progress is True
         self._call = None if isinstance(progress, bool) else progress
         self._bar: tqdm | None = None

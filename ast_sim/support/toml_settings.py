@@ -173,7 +173,8 @@ def _build(cls: Any, given: Any, values: Mapping[str, Any], prefix: str = "") ->
     arguments = {}
     kinds = get_type_hints(cls)
     for item in dataclasses.fields(cls):
-        key, kind = prefix + item.name, kinds[item.name]
+        key = prefix + item.name
+        kind = kinds[item.name]
         if FROM_DATA in item.metadata:
             arguments[item.name] = getattr(given, item.name, item.default)
         elif dataclasses.is_dataclass(kind):
@@ -192,7 +193,8 @@ def _leaves(cls: type, given: Any = NOTHING, prefix: str = "") -> Iterator[tuple
     its values; it decides the classes of the groups."""
     kinds = get_type_hints(cls)
     for item in dataclasses.fields(cls):
-        key, kind = prefix + item.name, kinds[item.name]
+        key = prefix + item.name
+        kind = kinds[item.name]
         if FROM_DATA in item.metadata:
             continue
         if dataclasses.is_dataclass(kind):
@@ -205,7 +207,8 @@ def _facts(cls: type, given: Any, prefix: str = "") -> Iterator[str]:
     """The dotted keys that facts of the data would have if they were settings; arguments as of `_leaves`."""
     kinds = get_type_hints(cls)
     for item in dataclasses.fields(cls):
-        key, kind = prefix + item.name, kinds[item.name]
+        key = prefix + item.name
+        kind = kinds[item.name]
         if FROM_DATA in item.metadata:
             names = [fact.name for fact in dataclasses.fields(kind)]
             yield from (key, *(prefix + name for name in names), *(f"{key}.{name}" for name in names))

@@ -27,7 +27,8 @@ CONSTANT = 1e-3
 def introduction(model: Simulator, config: RunConfig, dataset: Dataset, scales: DataScales, pairs: int) -> list[str]:
     """Lines with the sizes of the model and the data, the number of steps, and the noise relative to lengths of the
     data."""
-    options, unit = config.train, dataset.info.length_unit
+    options = config.train
+    unit = dataset.info.length_unit
     steps = Schedule.of(options).steps
     noise = options.noise or 0.0
     scenes = options.batch_size * options.accumulate
@@ -122,7 +123,9 @@ class StepLog:
     def __init__(
         self, metrics: Metrics, schedule: Schedule, dataset: Dataset, clock: Clock, listener: Listener
     ) -> None:
-        self.metrics, self.schedule, self.clock = metrics, schedule, clock
+        self.metrics = metrics
+        self.schedule = schedule
+        self.clock = clock
         self.listener = listener
         self.validates = dataset.count("valid") > 0
         self.sums: dict[str, float] = {}

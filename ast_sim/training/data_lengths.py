@@ -76,7 +76,8 @@ def measure(dataset: Dataset) -> DataScales:
     room = math.inf
     doubts: list[tuple[str, Finding]] = []
     for name, trajectory in dataset.spread("train", MEASURED):
-        scene, position = trajectory.scene, trajectory.position
+        scene = trajectory.scene
+        position = trajectory.position
         scene.require_predictable(name)
         dataset.material.require_possible(name, scene.material, ~scene.rigid_elements)
         doubts += [(name, finding) for finding in (*folded_inside_out(scene), *negative_stress(trajectory))]

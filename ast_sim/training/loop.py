@@ -85,7 +85,11 @@ class Training:
         callback: Callback | None = None,
         progress: ShowProgress = True,
     ) -> None:
-        self.run, self.config, self.dataset, self.scales, self.signals = run, config, dataset, scales, signals
+        self.run = run
+        self.config = config
+        self.dataset = dataset
+        self.scales = scales
+        self.signals = signals
         self.options = config.train
         self.processes = processes or Processes()
         self.schedule = Schedule.of(config.train)

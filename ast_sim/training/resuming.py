@@ -30,8 +30,13 @@ class Saver:
         processes: Processes,
         tell: Callable[[str], None],
     ) -> None:
-        self.run, self.dataset, self.model, self.optimizer = run, dataset, model, optimizer
-        self.pool, self.processes, self.tell = pool, processes, tell
+        self.run = run
+        self.dataset = dataset
+        self.model = model
+        self.optimizer = optimizer
+        self.pool = pool
+        self.processes = processes
+        self.tell = tell
 
     def save(self, step: int, sums: dict[str, float], keep: int) -> None:
         """Write the checkpoint of a step; it holds the number of lines in `metrics.jsonl`."""

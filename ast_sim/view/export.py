@@ -178,4 +178,5 @@ def _write_steps(root: h5py.Group, shown: Fields) -> None:
             data.create_dataset(name, data=flat, chunks=(rows, *flat.shape[1:]), compression="gzip")
             offsets[name] = start * rows
         for name, values in static.items():
-            data[name], offsets[name] = values, zero
+            data[name] = values
+            offsets[name] = zero

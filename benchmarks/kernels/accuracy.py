@@ -12,15 +12,21 @@ from pathlib import Path
 
 import torch
 
-from ast_sim.ops import EdgeSet, TetrahedronSet, octree
-from ast_sim.ops import _attention as attention
-from ast_sim.ops import _elastic_forces as elastic
-from ast_sim.ops import _linear as linear
-from ast_sim.ops import _message as message
-from ast_sim.ops import _mlp as mlp
-from ast_sim.ops import _segment as segment
-from ast_sim.ops import _sparse_conv as sparse_conv
-from ast_sim.ops.library import configuration
+from ast_sim.ops import (
+    EdgeSet,
+    TetrahedronSet,
+    attention,
+    linear,
+    message_sum,
+    mlp,
+    octree,
+    segment_mean,
+    segment_sum,
+    sparse_conv,
+    sparse_conv_transposed,
+)
+from ast_sim.ops import elastic_forces as forces_of
+from ast_sim.ops.library import OPS, configuration
 from benchmarks.kernels.elastic_forces import box
 from tests.checks import errors
 
@@ -38,12 +44,12 @@ def segments(seed: int) -> Iterator[tuple[str, Case]]:
     offsets = torch.cat([torch.tensor([0]), torch.randint(0, rows + 1, (groups - 1,), generator=g).sort().values])
     offsets = torch.cat([offsets, torch.tensor([rows])])
     x = torch.randn(rows, width, generator=g)
-    for name, mean in (("segment_sum", False), ("segment_mean", True)):
+    for name, op, mean in (("segment_sum", segment_sum, False), ("segment_mean", segment_mean, True)):
         yield (
             name,
             (
-                lambda x, mean=mean: segment._sum(x, order, offsets, mean),
-                lambda x, mean=mean: segment._sum_reference(x, order, offsets, mean),
+                lambda x, op=op: op(x, order, offsets),
+                lambda x, mean=mean: OPS["segment_sum"].composition(x, order, offsets, mean),
                 [x],
                 ["out", "dx"],
             ),
@@ -60,12 +66,12 @@ def elastic_forces(seed: int) -> Iterator[tuple[str, Case]]:
 
     def composition(x):
         stiff = (rest.to(x.dtype), lame.to(x.dtype))
-        return elastic._reference(x, *stiff, tets.elements, tets.node_order, tets.node_offsets)
+        return OPS["elastic_forces"].composition(x, *stiff, tets.elements, tets.node_order, tets.node_offsets)
 
     position = rest + scale * (0.01, 0.1, 0.5)[seed % 3] * torch.randn(nodes.shape, generator=g)
     yield (
         "elastic_forces",
-        (lambda x: elastic.elastic_forces(x, rest, lame, tets), composition, [position], ["force", "dposition"]),
+        (lambda x: forces_of(x, rest, lame, tets), composition, [position], ["force", "dposition"]),
     )
 
 
@@ -81,8 +87,8 @@ def attentions(seed: int) -> Iterator[tuple[str, Case]]:
         yield (
             name,
             (
-                lambda q, k, v, s=settings: attention.attention(q, k, v, *offsets, *s)[0],
-                lambda q, k, v, s=settings: attention._reference(q, k, v, *offsets, *s)[0],
+                lambda q, k, v, s=settings: attention(q, k, v, *offsets, *s)[0],
+                lambda q, k, v, s=settings: OPS["attention"].composition(q, k, v, *offsets, *s)[0],
                 [q, k, v],
                 ["out", "dq", "dk", "dv"],
             ),
@@ -97,16 +103,16 @@ def convolutions(seed: int) -> Iterator[tuple[str, Case]]:
     widths = [int(n) for n in torch.randint(1, 160, (2,), generator=g)]
     weight = torch.randn(27, *widths, generator=g)
     for name, op, rows, pairs, out in (
-        ("sparse_conv", sparse_conv.sparse_conv, cells.num_fine,
+        ("sparse_conv", sparse_conv, cells.num_fine,
          (cells.fine, cells.coarse_index, cells.coarse_by_fine, cells.fine_by_fine), len(cells.coarse.keys)),
-        ("sparse_conv_transposed", sparse_conv.sparse_conv_transposed, len(cells.coarse.keys),
+        ("sparse_conv_transposed", sparse_conv_transposed, len(cells.coarse.keys),
          (cells.coarse_by_fine, cells.fine_by_fine, cells.fine, cells.coarse_index), cells.num_fine),
     ):  # fmt: skip
         yield (
             name,
             (
                 lambda x, w, b, op=op: op(x, w, cells, b),
-                lambda x, w, b, pairs=pairs, out=out: sparse_conv._reference(
+                lambda x, w, b, pairs=pairs, out=out: OPS["sparse_conv"].composition(
                     x, w, b, False, cells.pair_offsets, *pairs, out
                 ),
                 [torch.randn(rows, widths[0], generator=g), weight, torch.randn(widths[1], generator=g)],
@@ -125,13 +131,14 @@ def messages(seed: int) -> Iterator[tuple[str, Case]]:
     plain = [torch.randn(shape, generator=g) * (shape[0] ** -0.5 if i == 2 else 1) for i, shape in enumerate(shapes)]
     shapes = [(len(edges), 8), (width, 8), (width,), (width, width)]
     encoder = [torch.randn(shape, generator=g) * (width**-0.5 if i == 3 else 1) for i, shape in enumerate(shapes)]
-    lists, none = (edges.senders, edges.receivers, None, False), message._of_edges(edges, plain[0], None, None)
+    lists = (edges.senders, edges.receivers, None, False)
+    none = [torch.empty(shape) for shape in ((len(edges), 0), (0, 0), 0, (width, 0))]
     results = ["out", "dof_senders", "dof_receivers", "dW2", "db2", "dgamma", "dbeta"]
     yield (
         "message_sum",
         (
-            lambda P, Q, *layer: message.message_sum(edges, P, Q, None, None, *layer),
-            lambda P, Q, *layer: message._reference(P, Q, *(x.to(P) for x in none), *layer, *lists)[0],
+            lambda P, Q, *layer: message_sum(edges, P, Q, None, None, *layer),
+            lambda P, Q, *layer: OPS["message"].composition(P, Q, *(x.to(P) for x in none), *layer, *lists)[0],
             plain,
             results,
         ),
@@ -139,8 +146,8 @@ def messages(seed: int) -> Iterator[tuple[str, Case]]:
     yield (
         "message_sum, encoder",
         (
-            lambda P, Q, a, b, c, d, e, *x: message.message_sum(edges, P, Q, e, tuple(x), a, b, c, d),
-            lambda P, Q, a, b, c, d, e, *x: message._reference(P, Q, e, *x, a, b, c, d, *lists)[0],
+            lambda P, Q, a, b, c, d, e, *x: message_sum(edges, P, Q, e, tuple(x), a, b, c, d),
+            lambda P, Q, a, b, c, d, e, *x: OPS["message"].composition(P, Q, e, *x, a, b, c, d, *lists)[0],
             [*plain, *encoder],
             [*results, "dedge_features", "dA1", "da1", "dA2"],
         ),
@@ -154,12 +161,12 @@ def layers(seed: int) -> Iterator[tuple[str, Case]]:
     x, extra, dout = (torch.randn(rows, n, generator=g) for n in (inputs, beside, outputs))
     weight, bias = torch.randn(outputs, inputs, generator=g), torch.randn(outputs, generator=g)
     results = ["out", "dx", "dweight", "dbias"]
-    for number, activation in enumerate(linear.ACTIVATIONS):
+    for number, activation in enumerate(("none", "relu", "geglu")):
         yield (
             f"linear, {activation}",
             (
-                lambda x, w, b, a=activation: linear.linear(x, w, b, a),
-                lambda x, w, b, a=number: linear._linear_reference(x, w, b, None, a, False)[0],
+                lambda x, w, b, a=activation: linear(x, w, b, a),
+                lambda x, w, b, a=number: OPS["linear"].composition(x, w, b, None, a, False)[0],
                 [x, weight, bias],
                 results,
             ),
@@ -170,8 +177,8 @@ def layers(seed: int) -> Iterator[tuple[str, Case]]:
     yield (
         "mlp",
         (
-            lambda x, y, w1, b1, w2, b2, c, d, r: mlp.mlp(x, w1, b1, w2, b2, y, (c, d), r),
-            lambda x, y, w1, b1, w2, b2, c, d, r: mlp._reference(x, y, w1, b1, w2, b2, c, d, r, False)[0],
+            lambda x, y, w1, b1, w2, b2, c, d, r: mlp(x, w1, b1, w2, b2, y, (c, d), r),
+            lambda x, y, w1, b1, w2, b2, c, d, r: OPS["mlp"].composition(x, y, w1, b1, w2, b2, c, d, r, False)[0],
             [x, extra, w1, b1, w2, bias, gamma, bias.clone(), dout],
             ["out", "dx", "dbeside", "dweight1", "dbias1", "dweight2", "dbias2", "dgamma", "dbeta", "dresidual"],
         ),

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn.functional import dropout, scaled_dot_product_attention
 
 from ast_sim.ops import attention
-from ast_sim.ops._attention import _reference
+from ast_sim.ops.library import OPS
 from benchmarks.kernels.case import Case
 
 # scenes, queries and keys of a scene, heads, channels of a head
@@ -93,7 +93,7 @@ def _case(size: tuple[int, int, int, int, int], p: float, backward: bool) -> Cas
         one = [x[:, :1].contiguous() for x in (q, k, v)]
         drawn = (q_offsets, k_offsets, width**-0.5, p, 0)
         mine = _with_gradients(lambda *x: attention(*x, *drawn)[0], one, dout[:, :1])()
-        composed = _with_gradients(lambda *x: _reference(*x, *drawn)[0], one, dout[:, :1])()
+        composed = _with_gradients(lambda *x: OPS["attention"].composition(*x, *drawn)[0], one, dout[:, :1])()
         for a, b in zip(mine, composed, strict=True):
             torch.testing.assert_close(a, b, **TOLERANCE)
 

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from ast_sim.ops import farthest_point_sample, octree
-from ast_sim.ops._fps import _sample
+from ast_sim.ops.library import OPS
 from benchmarks.kernels.case import Case
 
 
@@ -50,7 +50,7 @@ def _cells(points: int, scenes: int, depth: int) -> tuple[torch.Tensor, torch.Te
 
 
 def cases() -> list[Case]:
-    found = []
+    all_cases = []
     for scenes, points, depth, num in (
         (4, 360, 5, 90),
         (1, 4096, 12, 1024),
@@ -69,9 +69,9 @@ def cases() -> list[Case]:
             return _sample_scenes(floats, scenes, num, height)
 
         def composed(coordinates=coordinates, offsets=offsets, num=num):
-            return _sample.reference(coordinates, offsets, num)[0]
+            return OPS["farthest_point_sample"].reference(coordinates, offsets, num)[0]
 
-        found.append(
+        all_cases.append(
             Case(
                 "farthest_point_sample",
                 f"{f'{scenes} scenes of ' if scenes > 1 else ''}{points} cells to {num}",
@@ -82,4 +82,4 @@ def cases() -> list[Case]:
                 lambda ours=ours, theirs=theirs, composed=composed: _assert_exact(ours(), theirs(), composed()),
             )
         )
-    return found
+    return all_cases

@@ -69,12 +69,12 @@ def _case(name: str, shape: str, ours: Callable, peers: dict[str, Callable], inp
 
 
 def cases() -> list[Case]:
-    found = []
+    all_cases = []
     g = torch.Generator().manual_seed(0)
     for geglu, sizes in ((False, LINEAR), (True, GEGLU)):
         for rows, inputs, outputs in sizes:
             x, weight, bias = (torch.randn(s, generator=g) for s in ((rows, inputs), (outputs, inputs), (outputs,)))
-            found += _case(
+            all_cases += _case(
                 "linear, GEGLU" if geglu else "linear",
                 f"{rows} x {inputs} x {outputs}",
                 (lambda x, w, b: linear(x, w, b, "geglu")) if geglu else linear,
@@ -90,7 +90,7 @@ def cases() -> list[Case]:
         def ours(x, w1, b1, w2, b2, gamma, beta):
             return mlp(x, w1, b1, w2, b2, norm=(gamma, beta))
 
-        found += _case(
+        all_cases += _case(
             "mlp with LayerNorm", f"{rows} x 128-128-128", ours, {"torch composition": _mlp}, x, 4 * rows * 128**2
         )
-    return found
+    return all_cases

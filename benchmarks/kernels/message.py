@@ -11,7 +11,7 @@ from __future__ import annotations
 import torch
 
 from ast_sim.ops import EdgeSet, message_sum
-from ast_sim.ops import _message as ops
+from ast_sim.ops.library import OPS
 from benchmarks.kernels.case import Case
 
 WIDTH = 128
@@ -70,9 +70,11 @@ def _case(name: str, edges: EdgeSet, raw: int, backward: bool) -> Case:
         return message_sum(edges, P, Q, features, encoder, *weights[-4:])
 
     def composition_of(P, Q, *weights):
-        encoder = weights[:3] if encodes else None
-        of_edges = ops._of_edges(edges, P, features, encoder)
-        return ops._reference(P, Q, *of_edges, *weights[-4:], edges.senders, edges.receivers, None, False)[0]
+        empty = [P.new_empty(shape) for shape in ((0, raw), 0, (WIDTH, 0))]
+        encoder = weights[:3] if encodes else empty
+        of_edges = P.new_empty(len(edges), 0) if features is None else features
+        lists = (edges.senders, edges.receivers, None, False)
+        return OPS["message"].composition(P, Q, of_edges, *encoder, *weights[-4:], *lists)[0]
 
     def call(function):
         if not backward:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ast_sim.ops import _octree as ops
 from ast_sim.ops import octree
+from ast_sim.ops.library import OPS
 from benchmarks.kernels.case import Case
 
 ORIGIN, DEPTH, COARSEST = [0.0, 0.0, 0.0], 12, 8
@@ -32,30 +32,30 @@ def _all_levels(positions: Tensor, offsets: Tensor, depth: int, levels: int, bui
 
 
 def cases() -> list[Case]:
-    found = []
+    all_cases = []
     for points in (10_000, 100_000, 1_000_000):
         build = (sphere(points), torch.tensor([0, points]), *ORIGIN, 1.0, DEPTH)
         tree = octree(*build[:2], ORIGIN, 1.0, DEPTH)
         shape = f"{points} points on a sphere, depth {DEPTH}"
-        found.append(
+        all_cases.append(
             _case(
                 "octree",
                 shape,
                 points,
-                lambda build=build: ops._octree(*build),
-                lambda build=build: ops._octree.reference(*build),
+                lambda build=build: OPS["octree"](*build),
+                lambda build=build: OPS["octree"].reference(*build),
             )
         )
         if points > 100_000:
             continue  # the composition takes many seconds
         down = (tree.keys, tree.cell_offsets, DEPTH - COARSEST)
-        found.append(
+        all_cases.append(
             _case(
                 "octree_coarsen",
                 f"{shape} to {COARSEST}, with pairs",
                 points,
-                lambda down=down: ops._coarsen(*down),
-                lambda down=down: ops._coarsen.reference(*down),
+                lambda down=down: OPS["octree_coarsen"](*down),
+                lambda down=down: OPS["octree_coarsen"].reference(*down),
             )
         )
     plate = torch.cat([sphere(400) * torch.tensor([1, 1, 0.02]) for _ in range(4)])
@@ -66,13 +66,13 @@ def cases() -> list[Case]:
         positions, scenes, depth, levels = args
         offsets = torch.arange(scenes + 1) * (len(positions) // scenes)
         inputs = (positions, offsets, depth, levels)
-        found.append(
+        all_cases.append(
             _case(
                 "octree_levels",
                 shape,
                 len(positions),
-                lambda inputs=inputs: _all_levels(*inputs, ops._octree, ops._coarsen),
-                lambda inputs=inputs: _all_levels(*inputs, ops._octree.reference, ops._coarsen.reference),
+                lambda inputs=inputs: _all_levels(*inputs, OPS["octree"], OPS["octree_coarsen"]),
+                lambda inputs=inputs: _all_levels(*inputs, OPS["octree"].reference, OPS["octree_coarsen"].reference),
             )
         )
-    return found
+    return all_cases

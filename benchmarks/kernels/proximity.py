@@ -7,7 +7,7 @@ import torch
 
 from ast_sim.element_topology import surface_triangles
 from ast_sim.ops import proximity
-from ast_sim.ops._body_distance import _proximity
+from ast_sim.ops.library import OPS
 from benchmarks.kernels.case import Case
 from benchmarks.kernels.elastic_forces import box
 
@@ -32,8 +32,8 @@ def _case(cells: tuple[int, int, int]) -> Case:
     arguments = (position, torch.zeros_like(position), ends[0], body, surface, ends[1], 1.5)
 
     def check() -> None:
-        assert (proximity(*arguments) - _proximity.composition(*arguments)).abs().max() <= 1e-6
+        assert (proximity(*arguments) - OPS["proximity"].composition(*arguments)).abs().max() <= 1e-6
 
     shape = f"{2 * size} nodes, {len(surface)} triangles"
-    peers = {"libigl": lambda: _proximity.composition(*arguments)}
+    peers = {"libigl": lambda: OPS["proximity"].composition(*arguments)}
     return Case("proximity", shape, lambda: proximity(*arguments), peers, 2 * size, None, check)

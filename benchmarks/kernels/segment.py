@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from ast_sim.ops import segment_sum
-from ast_sim.ops._edges import offsets_of
+from ast_sim.ops import offsets_of, segment_sum
 from benchmarks.kernels.case import Case
 
 SIZES = [(3000, 500, 64), (300_000, 50_000, 128)]  # rows, segments, channels

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ast_sim.ops import CellMap, Octree, octree, sparse_conv
-from ast_sim.ops import _sparse_conv as ops
+from ast_sim.ops.library import OPS
 from benchmarks.kernels.case import Case
 
 CHANNELS = 128
@@ -79,7 +79,7 @@ def _level(map: CellMap, backward: bool) -> tuple[Call, dict[str, Call], dict[st
     pairs = (map.pair_offsets, map.fine, map.coarse_index, map.coarse_by_fine, map.fine_by_fine)
 
     def composition(x, weight):
-        return ops._reference(x, weight, None, False, *pairs, len(map.coarse.keys))
+        return OPS["sparse_conv"].composition(x, weight, None, False, *pairs, len(map.coarse.keys))
 
     functions = {"ours": lambda x, w: sparse_conv(x, w, map), "torch composition": composition}
     if backward:

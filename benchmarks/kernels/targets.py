@@ -91,8 +91,8 @@ def seconds_of(record: dict) -> float | None:
 
 
 def best_peer(record: dict, pattern: str = "") -> tuple[str, float] | None:
-    found = {name: t for name, t in peers_of(record).items() if re.search(pattern, name)}
-    return min(found.items(), key=lambda x: x[1]) if found else None
+    peers = {name: t for name, t in peers_of(record).items() if re.search(pattern, name)}
+    return min(peers.items(), key=lambda x: x[1]) if peers else None
 
 
 def target_of(record: dict) -> Target | None:

@@ -128,10 +128,10 @@ def run_command(name: str, folder: Path) -> tuple[str, Results, str]:
         lines = [line for line in text.splitlines() if not line.startswith("warning: ")]
         if code:
             return ("refused" if code == 2 and len(lines) == 1 else "traceback"), {}, text
-        found = results(name, folder, said.getvalue())
+        values = results(name, folder, said.getvalue())
     except Exception:
         return "traceback", {}, traceback.format_exc()
-    return ("warned" if text else "same"), found, text
+    return ("warned" if text else "same"), values, text
 
 
 def results(name: str, folder: Path, said: str) -> Results:
@@ -142,8 +142,8 @@ def results(name: str, folder: Path, said: str) -> Results:
         return dict(flat(json.loads((folder / "evaluation.json").read_text())))
     last, run = checkpoint.at_step(folder / "run", STEPS), folder / "run"
     files = {path: hashlib.sha256(path.read_bytes()).hexdigest() for path in (*last.iterdir(), run / "best")}
-    found = {str(path.relative_to(folder)): value for path, value in files.items()}
-    return {**found, **dict(flat(list(Metrics(run)), "metrics"))}
+    digests = {str(path.relative_to(folder)): value for path, value in files.items()}
+    return {**digests, **dict(flat(list(Metrics(run)), "metrics"))}
 
 
 def flat(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
@@ -175,9 +175,9 @@ class Bench:
 
     def _intact(self, name: str) -> Results:
         self.renew()
-        outcome, found, text = run_command(name, self.copy)
+        outcome, values, text = run_command(name, self.copy)
         assert outcome == "same", text
-        return found
+        return values
 
     def renew(self) -> None:
         shutil.rmtree(self.copy, ignore_errors=True)
@@ -189,12 +189,12 @@ class Bench:
         damage.apply(self.copy)
         worst = ("same", "")
         for name in READERS[damage.group]:
-            found, values, text = run_command(name, self.copy)
+            outcome, values, text = run_command(name, self.copy)
             expected = self.expected[name]
             wrong = [key for key in expected if values.get(key) != expected[key]]
-            if found == "same" and wrong:
-                found, text = "silent", f"{name}: {wrong[0]}: {values.get(wrong[0])!r}, not {expected[wrong[0]]!r}"
-            worst = max(worst, (found, text), key=lambda pair: OUTCOMES.index(pair[0]))
+            if outcome == "same" and wrong:
+                outcome, text = "silent", f"{name}: {wrong[0]}: {values.get(wrong[0])!r}, not {expected[wrong[0]]!r}"
+            worst = max(worst, (outcome, text), key=lambda pair: OUTCOMES.index(pair[0]))
         return worst
 
 
@@ -225,11 +225,11 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="seed of the damages (%(default)s)")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        found = measure(arguments.flips, arguments.cuts, arguments.seed, Path(folder))
+        record = measure(arguments.flips, arguments.cuts, arguments.seed, Path(folder))
     command = " ".join(["python -m benchmarks.robustness.damage", *sys.argv[1:]])
-    write_json(arguments.json, {**provenance(command), **found})
-    print(json.dumps(found["totals"]))
-    if found["bad"]:
+    write_json(arguments.json, {**provenance(command), **record})
+    print(json.dumps(record["totals"]))
+    if record["bad"]:
         sys.exit(1)
 
 

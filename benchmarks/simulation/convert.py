@@ -160,7 +160,7 @@ def main() -> None:
         print(f"target of {TARGET:.0f} MB/s by the {kind}: {'reached' if yes else 'NOT reached'}")
     shutil.rmtree(arguments.folder)
     if arguments.json is not None:
-        found = {
+        record = {
             **provenance(" ".join(["python -m benchmarks.simulation.convert", *sys.argv[1:]])),
             "crc32c": google_crc32c.implementation,
             "bytes": size,
@@ -169,7 +169,7 @@ def main() -> None:
             "stages": stages,
         }
         arguments.json.parent.mkdir(parents=True, exist_ok=True)
-        arguments.json.write_text(json.dumps(found, indent=1) + "\n")
+        arguments.json.write_text(json.dumps(record, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -114,13 +114,13 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     FOLDER.mkdir(parents=True, exist_ok=True)
-    found = {
+    record = {
         **provenance(" ".join(["python -m benchmarks.simulation.generation", *sys.argv[1:]])),
         **measure(args.family, args.workers),
     }
-    print(json.dumps(found["summary"], indent=1))
+    print(json.dumps(record["summary"], indent=1))
     if args.json is not None:
-        args.json.write_text(json.dumps(found, indent=1) + "\n")
+        args.json.write_text(json.dumps(record, indent=1) + "\n")
 
 
 if __name__ == "__main__":

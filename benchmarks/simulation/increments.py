@@ -36,11 +36,12 @@ def main() -> None:
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("--json", type=Path, required=True, metavar="FILE", help="write what is found here")
     arguments = parser.parse_args()
-    found = measure(arguments.checkpoint)
+    record = measure(arguments.checkpoint)
     write_json(
-        arguments.json, {**provenance(" ".join(["python -m benchmarks.simulation.increments", *sys.argv[1:]])), **found}
+        arguments.json,
+        {**provenance(" ".join(["python -m benchmarks.simulation.increments", *sys.argv[1:]])), **record},
     )
-    print(f"{len(found['increments'])} increments in {found['seconds']:,.0f} s")
+    print(f"{len(record['increments'])} increments in {record['seconds']:,.0f} s")
 
 
 if __name__ == "__main__":

@@ -51,11 +51,11 @@ def seconds(workers: dict[str, Worker], samples: int, frames: int) -> dict[str, 
     """Seconds of one predicted frame, for each worker; a sample is the mean of `frames` of them."""
     for worker in workers.values():
         worker.ask("rollout", frames)  # fills caches
-    found: dict[str, list[float]] = {name: [] for name in workers}
+    times: dict[str, list[float]] = {name: [] for name in workers}
     for _ in range(samples):
         for name, worker in workers.items():
-            found[name].append(worker.ask("rollout", frames))
-    return {name: {"min": min(s), "median": statistics.median(s), "samples": s} for name, s in found.items()}
+            times[name].append(worker.ask("rollout", frames))
+    return {name: {"min": min(s), "median": statistics.median(s), "samples": s} for name, s in times.items()}
 
 
 def measure(setup: Setup, threads: int, samples: int, frames: int, folder: Path) -> dict[str, Any]:
@@ -64,19 +64,19 @@ def measure(setup: Setup, threads: int, samples: int, frames: int, folder: Path)
     try:
         for name, spins in SPINS.items():
             workers[name] = Worker("c", threads, setup, folder / f"{name}.log", {"GOMP_SPINCOUNT": spins})
-        found = {"alone": seconds(workers, samples, frames)}
+        by_load = {"alone": seconds(workers, samples, frames)}
         for name, nice in NICE.items():
             with busy_loops(threads, nice):
-                found[name] = seconds(workers, samples, frames)
+                by_load[name] = seconds(workers, samples, frames)
     finally:
         for worker in workers.values():
             worker.close()
-    median = {name: {way: values[way]["median"] for way in SPINS} for name, values in found.items()}
+    median = {name: {way: values[way]["median"] for way in SPINS} for name, values in by_load.items()}
     return {
         way: {
             "price": median["alone"][way] / median["alone"]["spins"],
             "ratio": {name: median[name][way] / median["alone"][way] for name in NICE},
-            **{name: values[way] for name, values in found.items()},
+            **{name: values[way] for name, values in by_load.items()},
         }
         for way in SPINS
     }
@@ -96,14 +96,14 @@ def main() -> None:
         settings = ["train.batch_size=1", "train.statistics_pairs=1", "train.steps=100"]
         setup = Setup(str(folder / "blocks.h5"), "ast", "tiny", settings, name)
         records = measure(setup, arguments.threads, arguments.samples, arguments.frames, folder)
-    found = {
+    record = {
         **provenance(" ".join(["python -m benchmarks.steps.busy", *sys.argv[1:]])),
         "threads": arguments.threads,
         "nodes": nodes,
         "note": f"{load:.1f} processes wanted to run on average in the minute before, on {os.cpu_count()} cores",
         **records,
     }
-    write_json(arguments.json, found)
+    write_json(arguments.json, record)
     print(json.dumps({way: {key: records[way][key] for key in ("price", "ratio")} for way in SPINS}, indent=2))
 
 

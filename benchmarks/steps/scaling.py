@@ -93,9 +93,9 @@ def main() -> None:
             data = Path(folder) / f"{size}.h5"
             nodes, elements = write_blocks(data, size)
             for model in list(running):
-                found = measure(model, data, arguments.threads, Path(folder))
-                record = {"model": model, "preset": PRESETS[model], "nodes": nodes, "elements": elements, **found}
-                if "failed" in found or found["seconds"]["min"] > arguments.longest:
+                figures = measure(model, data, arguments.threads, Path(folder))
+                record = {"model": model, "preset": PRESETS[model], "nodes": nodes, "elements": elements, **figures}
+                if "failed" in figures or figures["seconds"]["min"] > arguments.longest:
                     running.remove(model)
                 records.append(record)
                 print(json.dumps(record), flush=True)

@@ -12,15 +12,15 @@ from benchmarks.svg import axes_of_picture, save
 Record = dict[str, Any]
 
 
-def section(found: dict[str, Any]) -> str:
+def section(results: dict[str, Any]) -> str:
     """What was measured, a table of times and one of memory, and why models were given up."""
-    threads, limit = found["threads"], found["memory_limit_bytes"] / 1e9
-    records = found["records"]
+    threads, limit = results["threads"], results["memory_limit_bytes"] / 1e9
+    records = results["records"]
     lines = ["## By the size of the mesh", ""]
     lines += [
         "A training step on one scene of two blocks of tetrahedra, models as the AST paper has them (Transolver as its"
-        f" authors do), {threads} threads, at most {limit:.0f} GB; commit {(found['commit'] or '?')[:10]},"
-        f" {found['processor']}.",
+        f" authors do), {threads} threads, at most {limit:.0f} GB; commit {(results['commit'] or '?')[:10]},"
+        f" {results['processor']}.",
         "",
         "Seconds a training step (the least of three):",
         "",
@@ -57,12 +57,12 @@ def _cell(record: Record | None, value: Callable[[Record], float]) -> str:
     return "failed" if "failed" in record else f"{value(record):.3g}"
 
 
-def draw(found: dict[str, Any], file: Path) -> None:
+def draw(results: dict[str, Any], file: Path) -> None:
     """Seconds and gigabytes over nodes, both axes logarithmic, a line a model; memory is dashed."""
     figure, axes = axes_of_picture(7.2, 4.4)
     beside = axes.twinx()
     for number, (model, title) in enumerate(TITLES.items()):
-        records = [record for record in found["records"] if record["model"] == model and "failed" not in record]
+        records = [record for record in results["records"] if record["model"] == model and "failed" not in record]
         nodes = [record["nodes"] for record in records]
         axes.plot(nodes, [record["seconds"]["min"] for record in records], "o-", color=f"C{number}", label=title)
         beside.plot(nodes, [record["peak_resident_bytes"] / 1e9 for record in records], ".--", color=f"C{number}")

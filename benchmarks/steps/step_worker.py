@@ -64,8 +64,8 @@ def mean_seconds(step: Callable[[], object], count: int) -> float:
 
 
 def shares(step: Callable[[], object], count: int) -> dict[str, float]:
-    found = profile(step, count)
-    return {kind: found.share(kind) for kind in KINDS}
+    times = profile(step, count)
+    return {kind: times.share(kind) for kind in KINDS}
 
 
 def rollout_step(training: Training) -> Callable[[], object]:

@@ -149,8 +149,8 @@ def main() -> None:
         made = provenance(f"python -m benchmarks.studies {arguments.study}")
         known = finished(file, study, entries)
         with closing(conduct(study, entries, data, FOLDER / name, arguments.workers, known)) as rows:
-            for found in rows:
-                write_json(file, {**made, "study": asdict(study), "scenes": scenes, "models": found})
+            for models in rows:
+                write_json(file, {**made, "study": asdict(study), "scenes": scenes, "models": models})
                 write_page(RESULTS, Path("docs/results"))
     except AstSimError as error:
         sys.exit(str(error))

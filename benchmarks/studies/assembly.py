@@ -130,7 +130,7 @@ def measured(name: str, folder: Path) -> dict[str, Any]:
     row = ROWS[name]
     run, data = trained(name, folder)
     with run.open(data) as dataset:
-        found = deepest_frames(run.model, dataset, "test", run.effort, row.solver_scenes, made_from=row.spec)
+        deepest = deepest_frames(run.model, dataset, "test", run.effort, row.solver_scenes, made_from=row.spec)
         curves = [_curve(run, dataset, index) for index in range(row.test)]
         solver_seconds = read_seconds(dataset).samples.values()
     return {
@@ -142,7 +142,7 @@ def measured(name: str, folder: Path) -> dict[str, Any]:
         "training": validation_curve(run),
         "curves": curves,
         "solver_curves": _solver_curves(row) if row.solver_scenes else [],
-        **asdict(found),
+        **asdict(deepest),
     }
 
 
@@ -176,8 +176,8 @@ def _solver_curves(row: Row) -> list[float]:
             nodes=row.nodes, workers=1,
         ).path  # fmt: skip
         with ast_sim.Dataset(again) as dataset:
-            found = read_seconds(dataset).samples
-    return [sum(found[f"test/{index:06d}"]) for index in range(row.solver_scenes)]
+            samples = read_seconds(dataset).samples
+    return [sum(samples[f"test/{index:06d}"]) for index in range(row.solver_scenes)]
 
 
 def page(results: dict[str, Any]) -> str:
@@ -200,18 +200,18 @@ def page(results: dict[str, Any]) -> str:
     introduction = _INTRODUCTION.format(settings=settings_tried(shown))
     lines = [introduction, *table_head(alone, texts=2), *map(_alone, shown)]
     lines += [_TOGETHER, *table_head(together, texts=1), *map(_together, shown)]
-    return "\n".join([*lines, *(line for found in shown for line in _section(found))])
+    return "\n".join([*lines, *(line for record in shown for line in _section(record))])
 
 
-def _section(found: dict[str, Any]) -> list[str]:
+def _section(record: dict[str, Any]) -> list[str]:
     """The worst scenes of a row, and how its errors fell."""
     return [
         "",
-        f"## {found['row']['title']}",
+        f"## {record['row']['title']}",
         "",
-        f"{Effort(**found['effort']).text}. {over_the_scenes(found['scenes'])} The Newton steps have not converged in"
-        f" {found['not_converged']} of {len(found['scenes'])} scenes.",
-        *([curve_line(found["training"])] if found["training"] else []),
+        f"{Effort(**record['effort']).text}. {over_the_scenes(record['scenes'])} The Newton steps have not converged in"
+        f" {record['not_converged']} of {len(record['scenes'])} scenes.",
+        *([curve_line(record["training"])] if record["training"] else []),
     ]
 
 
@@ -240,35 +240,35 @@ other.
 """
 
 
-def _alone(found: dict[str, Any]) -> str:
-    row, solver = found["row"], found["solver"]
-    errors = [scene["relative_error"] for scene in found["scenes"] if scene["relative_error"] is not None]
-    spent = 60 * (found["generation_minutes"] + found["minutes"])
-    seconds = [scene["seconds"] for scene in found["scenes"]]
+def _alone(record: dict[str, Any]) -> str:
+    row, solver = record["row"], record["solver"]
+    errors = [scene["relative_error"] for scene in record["scenes"] if scene["relative_error"] is not None]
+    spent = 60 * (record["generation_minutes"] + record["minutes"])
+    seconds = [scene["seconds"] for scene in record["scenes"]]
     saved = 0.0 if solver is None else solver["seconds"] - solver["model_seconds"]
     return table_line([
         row["title"],
-        f"{row['train']} scenes ({found['generation_minutes']:.1f} min), {row['steps']:,} steps",
-        f"{found['minutes']:.0f}",
-        _percent([scene["by_calls"][0] for scene in found["scenes"] if scene["by_calls"]]),
+        f"{row['train']} scenes ({record['generation_minutes']:.1f} min), {row['steps']:,} steps",
+        f"{record['minutes']:.0f}",
+        _percent([scene["by_calls"][0] for scene in record["scenes"] if scene["by_calls"]]),
         _percent(errors),
-        _reaction(found, "reaction_alone"),
-        "-" if found["largest_stress"] is None else f"{100 * found['largest_stress']:.0f} %",
-        f"{1000 * found['seconds']:.0f} ms",
-        beside_solver(found["scenes"], [0.0] * len(found["scenes"]), seconds),
-        beside_solver(found["scenes"], [scene["relative_error"] for scene in found["scenes"]], seconds),
+        _reaction(record, "reaction_alone"),
+        "-" if record["largest_stress"] is None else f"{100 * record['largest_stress']:.0f} %",
+        f"{1000 * record['seconds']:.0f} ms",
+        beside_solver(record["scenes"], [0.0] * len(record["scenes"]), seconds),
+        beside_solver(record["scenes"], [scene["relative_error"] for scene in record["scenes"]], seconds),
         f"{spent / saved:,.0f} questions" if saved > 0 else "never: the solver is faster" if solver else "-",
     ])  # fmt: skip
 
 
-def _together(found: dict[str, Any]) -> str:
-    curves, solver = found["curves"], found["solver_curves"]
+def _together(record: dict[str, Any]) -> str:
+    curves, solver = record["curves"], record["solver_curves"]
     ratios = [theirs / ours["seconds"] for theirs, ours in zip(solver, curves, strict=False)]
     return table_line([
-        found["row"]["title"],
+        record["row"]["title"],
         str(curves[0]["frames"]),
         _percent([curve["relative_error"] for curve in curves]),
-        _reaction(found, "reaction"),
+        _reaction(record, "reaction"),
         f"{1000 * np.median([curve['seconds'] for curve in curves]):.0f} ms",
         times_as_long(solver, ratios) if solver else "-",
     ])  # fmt: skip
@@ -278,8 +278,8 @@ def _percent(errors: Sequence[float]) -> str:
     return f"{100 * np.mean(errors):.2g} ± {100 * np.std(errors) / len(errors) ** 0.5:.1g} %"
 
 
-def _reaction(found: dict[str, Any], key: str) -> str:
-    errors = [abs(c[key] / c["true_reaction"] - 1) for c in found["curves"] if c["true_reaction"] > 0]
+def _reaction(record: dict[str, Any], key: str) -> str:
+    errors = [abs(c[key] / c["true_reaction"] - 1) for c in record["curves"] if c["true_reaction"] > 0]
     return f"{100 * np.mean(errors):.2g} %, median {100 * np.median(errors):.2g} %"
 
 
@@ -287,8 +287,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     study_rows(__doc__, ROWS, arguments, measured, _said, (RESULTS, PAGE), page)
 
 
-def _said(found: dict[str, Any]) -> str:
-    return f"{100 * found['relative_error']:.3g} %, reaction {_reaction(found, 'reaction')}"
+def _said(record: dict[str, Any]) -> str:
+    return f"{100 * record['relative_error']:.3g} %, reaction {_reaction(record, 'reaction')}"
 
 
 if __name__ == "__main__":

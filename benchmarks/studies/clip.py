@@ -186,10 +186,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     torch.set_num_threads(1)
     os.environ["OMP_NUM_THREADS"] = "1"  # of the generator's processes
     ast_sim.keep_memory()
-    found = measured(Plan(), options.folder)
-    write_json(RESULTS, found)
-    write_text(PAGE, page(found) + "\n")
-    print(page(found))
+    results = measured(Plan(), options.folder)
+    write_json(RESULTS, results)
+    write_text(PAGE, page(results) + "\n")
+    print(page(results))
 
 
 if __name__ == "__main__":

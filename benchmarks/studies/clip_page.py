@@ -55,15 +55,15 @@ both. The run learns the error of its mesh with the rest.
 """
 
 
-def page(found: dict[str, Any]) -> str:
+def page(results: dict[str, Any]) -> str:
     """The page of the results."""
-    lines = [_INTRODUCTION.format(processor=found["processor"])]
+    lines = [_INTRODUCTION.format(processor=results["processor"])]
     for key, title in TABLES.items():
-        if found[key]:
-            lines += [*_answers(found[key], f"{len(found[key])} {title}"), ""]
-    lines += _figures(found)
-    lines += _variants(found)
-    return "\n".join([*lines, *_finer(found)])
+        if results[key]:
+            lines += [*_answers(results[key], f"{len(results[key])} {title}"), ""]
+    lines += _figures(results)
+    lines += _variants(results)
+    return "\n".join([*lines, *_finer(results)])
 
 
 def _answers(scenes: Sequence[dict[str, Any]], title: str) -> list[str]:
@@ -82,10 +82,10 @@ def _cells(values: np.ndarray) -> str:
     return f"{middle} | {100 * values.mean():.2g} % | {100 * np.quantile(values, 0.9):.2g} %"
 
 
-def _figures(found: dict[str, Any]) -> list[str]:
+def _figures(results: dict[str, Any]) -> list[str]:
     """What else was measured in the test scenes."""
-    scenes, plan, simulated = found["scenes"], found["plan"], found["simulation_seconds"]
-    lines = [f"- {_beside_process(found[key], title)}" for key, title in TABLES.items() if found[key]]
+    scenes, plan, simulated = results["scenes"], results["plan"], results["simulation_seconds"]
+    lines = [f"- {_beside_process(results[key], title)}" for key, title in TABLES.items() if results[key]]
     solver = float(np.median([scene["solver_seconds"] for scene in scenes]))
     for key, what in (("seconds", "all frames"), ("seconds_of_two", "the frames 3 and 6")):
         ratios = [scene["solver_seconds"] / scene[key] for scene in scenes]
@@ -97,7 +97,7 @@ def _figures(found: dict[str, Any]) -> list[str]:
     return [
         *lines,
         f"- The run: {plan['train']} scenes of about {plan['nodes']:,} nodes, {plan['steps']:,} steps in"
-        f" {duration(found['training_seconds'])}, {found['parameters']:,} weights. CalculiX took"
+        f" {duration(results['training_seconds'])}, {results['parameters']:,} weights. CalculiX took"
         f" {duration(simulated['train'] + simulated['valid'])} for the scenes of training and validation.",
         f"- Errors of the run in the field, medians: displacement {_median(scenes, 'turn_error')} when the ram turns,"
         f" {_median(scenes, 'last_error')} when it is back; plastic strain there {_median(scenes, 'strain_error')};"
@@ -136,16 +136,16 @@ def _worst(scenes: Sequence[dict[str, Any]]) -> str:
     return f"The worst sets of the run: {', '.join(told)}."
 
 
-def settings(found: dict[str, Any], number: str) -> dict[str, Setting]:
+def settings(results: dict[str, Any], number: str) -> dict[str, Setting]:
     """The errors and the seconds of the run, of the Gaussian process and of every setting of CalculiX in the scenes
     that were solved with other settings, by their names; infinite where there is no solution."""
-    scenes = [scene for scene in found["scenes"] if scene["name"] in clip_variants.SCENES]
+    scenes = [scene for scene in results["scenes"] if scene["name"] in clip_variants.SCENES]
     seconds = {"run": "seconds", "run_two_frames": "seconds_of_two"}
     made = {}
     for name, key in ANSWERS:
         spent = [scene[seconds[key]] if key in seconds else 0.0 for scene in scenes]
         made[name] = Setting(name, tuple(errors(scenes, key, number).tolist()), tuple(spent))
-    for name, solved in found["variants"].items():
+    for name, solved in results["variants"].items():
         if name != FINER.name:
             pairs = [
                 (abs(one[number] / scene["true"][number] - 1), one["seconds"])
@@ -157,9 +157,9 @@ def settings(found: dict[str, Any], number: str) -> dict[str, Setting]:
     return made
 
 
-def _variants(found: dict[str, Any]) -> list[str]:
+def _variants(results: dict[str, Any]) -> list[str]:
     """The table of the settings, who is as accurate as the run, and after how many questions each answer pays."""
-    off = {number: settings(found, number) for number in Outcome._fields}
+    off = {number: settings(results, number) for number in Outcome._fields}
     count = len(off["set"][OWN.name].errors)
     within = f"{math.ceil(0.9 * count)} of {count} below"
     lines = [
@@ -168,14 +168,14 @@ def _variants(found: dict[str, Any]) -> list[str]:
         "| --- |" + " ---: |" * 7,
     ]
     for name, of_set in off["set"].items():
-        solved = found["variants"].get(name, [])
+        solved = results["variants"].get(name, [])
         nodes = f"{np.median([one['nodes'] for one in solved if 'nodes' in one]):,.0f}" if solved else "-"
         failed = str(sum(len(one["failures"]) for one in solved)) if solved else "-"
         cells = [
             text for one in (of_set, off["peak"][name]) for text in (_share(np.median(one.errors)), _share(one.kept))
         ]
         lines.append(f"| {name} | {nodes} | {failed} | {' | '.join(cells)} | {_time(of_set.middle)} |")
-    return [*lines, "", *_verdicts(found, off)]
+    return [*lines, "", *_verdicts(results, off)]
 
 
 def _share(value: float) -> str:
@@ -186,11 +186,11 @@ def _time(seconds: float) -> str:
     return f"{1000 * seconds:.0f} ms" if 0 < seconds < 1 else f"{seconds:.3g} s" if 0 < seconds < math.inf else "-"
 
 
-def _verdicts(found: dict[str, Any], off: dict[str, dict[str, Setting]]) -> list[str]:
+def _verdicts(results: dict[str, Any], off: dict[str, dict[str, Setting]]) -> list[str]:
     """The fastest setting that is as accurate as the run, and the questions after which the run pays."""
     run = off["set"][ANSWERS[1][0]]
-    simulated = found["simulation_seconds"]
-    invested = simulated["train"] + simulated["valid"] + found["training_seconds"]
+    simulated = results["simulation_seconds"]
+    invested = simulated["train"] + simulated["valid"] + results["training_seconds"]
     own = off["set"][OWN.name]
     lines = [
         f"- Simulation and training took {duration(invested)} of one core. Beside CalculiX on the scene's own mesh, as"
@@ -200,7 +200,7 @@ def _verdicts(found: dict[str, Any], off: dict[str, dict[str, Setting]]) -> list
     for numbers, what in ((("set",), "in the set"), (("peak",), "in the force"), (("set", "peak"), "in both numbers")):
         fit = [
             off["set"][name]
-            for name in found["variants"]
+            for name in results["variants"]
             if name != FINER.name and all(off[n][name].kept <= off[n][run.name].kept for n in numbers)
         ]
         best = min(fit, key=lambda one: one.middle)
@@ -219,16 +219,16 @@ def _questions(invested: float, solver: Setting, run: Setting | None = None) -> 
     return f"{math.ceil(invested / saved):,} questions"
 
 
-def _finer(found: dict[str, Any]) -> list[str]:
+def _finer(results: dict[str, Any]) -> list[str]:
     """The error of the mesh beside the error of the run."""
-    solved = found["variants"][FINER.name]
+    solved = results["variants"][FINER.name]
     lines = [
-        _FINER.format(nodes=round(FINER.share * found["plan"]["nodes"])),
+        _FINER.format(nodes=round(FINER.share * results["plan"]["nodes"])),
         "| scene | nodes | set: own mesh off | run off own mesh | run off finer mesh | force: own mesh off"
         " | run off own mesh | run off finer mesh | time |",
         "| --- |" + " ---: |" * 8,
     ]
-    scenes = [scene for scene in found["scenes"] if scene["name"] in clip_variants.SCENES]
+    scenes = [scene for scene in results["scenes"] if scene["name"] in clip_variants.SCENES]
     for scene, one in zip(scenes, solved, strict=False):
         if "set" not in one:
             continue

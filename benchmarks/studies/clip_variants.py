@@ -95,7 +95,7 @@ def _solved(variant: Variant, spec: AssemblySpec, values: Values, nodes: int) ->
             continue
         if answer.attributes["status"] == "complete":
             seconds = sum(answer.attributes["solve_seconds"])
-            found = true_outcome(assembly.in_newton(answer, spec.unit))
-            return {"nodes": case.scene.num_nodes, **found._asdict(), "seconds": seconds, "failures": failures}
+            outcome = true_outcome(assembly.in_newton(answer, spec.unit))
+            return {"nodes": case.scene.num_nodes, **outcome._asdict(), "seconds": seconds, "failures": failures}
         failures.append(str(answer.attributes["stopped_by"]))
     return {"failures": failures}

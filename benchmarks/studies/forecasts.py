@@ -126,8 +126,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     study_rows(__doc__, ROWS, arguments, measured, _said, (RESULTS, PAGE), page)
 
 
-def _said(found: dict[str, Any]) -> str:
-    return percent(found["whole"]["error"], 3)
+def _said(results: dict[str, Any]) -> str:
+    return percent(results["whole"]["error"], 3)
 
 
 if __name__ == "__main__":

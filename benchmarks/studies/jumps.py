@@ -143,7 +143,7 @@ def measured(name: str, folder: Path) -> dict[str, Any]:
     row = ROWS[name]
     run, data = trained(name, folder)
     with run.open(data) as dataset:
-        found = deepest_frames(run.model, dataset, "test", run.effort, row.solver_scenes)
+        deepest = deepest_frames(run.model, dataset, "test", run.effort, row.solver_scenes)
         known = deepest_frames(run.model, dataset, "train", run.effort, most_scenes=TRAINING_SCENES).relative_error
         dial = [_turned(run, dataset, effort) for effort in _efforts(run)]
     return {
@@ -154,7 +154,7 @@ def measured(name: str, folder: Path) -> dict[str, Any]:
         "curve": validation_curve(run),
         "dial": dial,
         "training_scenes": known,
-        **asdict(found),
+        **asdict(deepest),
     }
 
 
@@ -169,13 +169,13 @@ def _efforts(run: ast_sim.Run) -> list[Effort]:
 
 def _turned(run: ast_sim.Run, dataset: ast_sim.Dataset, effort: Effort) -> dict[str, Any]:
     """The answers of one setting of the dial to all test scenes."""
-    found = deepest_frames(run.model, dataset, "test", effort)
+    deepest = deepest_frames(run.model, dataset, "test", effort)
     return {
         **asdict(effort),
-        "relative_error": [scene.relative_error for scene in found.scenes],
-        "seconds": [scene.seconds for scene in found.scenes],
-        "stress_share": found.stress_share,
-        "largest_stress": found.largest_stress,
+        "relative_error": [scene.relative_error for scene in deepest.scenes],
+        "seconds": [scene.seconds for scene in deepest.scenes],
+        "stress_share": deepest.stress_share,
+        "largest_stress": deepest.largest_stress,
     }
 
 
@@ -183,7 +183,7 @@ def page(results: dict[str, Any]) -> str:
     """The page of all rows that have a result."""
     shown = {name: results[name] for name in ROWS if name in results}
     introduction = _INTRODUCTION.format(settings=settings_tried(shown.values()))
-    return "\n".join([introduction, *_table(shown), *(line for found in shown.values() for line in _section(found))])
+    return "\n".join([introduction, *_table(shown), *(line for record in shown.values() for line in _section(record))])
 
 
 _INTRODUCTION = """# Any frame in one jump
@@ -215,19 +215,19 @@ the scenes in which the solver was run (ten; five pairs of parts), with its stan
 def _table(shown: dict[str, Any]) -> list[str]:
     head = ["scenes", "trained", "minutes", "effort", "error", "training scenes", "answer", "solver", "cheapest"]
     lines = ["| " + " | ".join(head) + " |", "| --- | --- | ---: | --- |" + " ---: |" * (len(head) - 4)]
-    for found in shown.values():
-        row, errors = found["row"], [scene["relative_error"] for scene in found["scenes"]]
-        seconds = [scene["seconds"] for scene in found["scenes"]]
+    for record in shown.values():
+        row, errors = record["row"], [scene["relative_error"] for scene in record["scenes"]]
+        seconds = [scene["seconds"] for scene in record["scenes"]]
         lines.append("| " + " | ".join([
             row["title"],
             _trained_text(row),
-            f"{found['minutes']:.0f}",
-            Effort(**found["effort"]).text if row["model_settings"].get("jumps", True) else "every frame",
+            f"{record['minutes']:.0f}",
+            Effort(**record["effort"]).text if row["model_settings"].get("jumps", True) else "every frame",
             _percent(errors),
-            f"{100 * found['training_scenes']:.1f} %",
+            f"{100 * record['training_scenes']:.1f} %",
             f"{1000 * np.median(seconds):.0f} ms",
-            beside_solver(found["scenes"], [0.0] * len(errors), seconds),
-            beside_solver(found["scenes"], errors, seconds),
+            beside_solver(record["scenes"], [0.0] * len(errors), seconds),
+            beside_solver(record["scenes"], errors, seconds),
         ]) + " |")  # fmt: skip
     return lines
 
@@ -244,30 +244,30 @@ def _percent(errors: list[float | None]) -> str:
     return f"{np.mean(known):.1f} ± {np.std(known) / len(known) ** 0.5:.1f} %{failed}"
 
 
-def _section(found: dict[str, Any]) -> list[str]:
-    lines = ["", f"## {found['row']['title']}", "", over_the_scenes(found["scenes"])]
-    not_converged = [scene["name"] for scene in found["scenes"] if (scene["last_step"] or 0) > STILL]
+def _section(record: dict[str, Any]) -> list[str]:
+    lines = ["", f"## {record['row']['title']}", "", over_the_scenes(record["scenes"])]
+    not_converged = [scene["name"] for scene in record["scenes"] if (scene["last_step"] or 0) > STILL]
     if not_converged:
-        share = f"{len(not_converged)} of {len(found['scenes'])} scenes"
+        share = f"{len(not_converged)} of {len(record['scenes'])} scenes"
         lines.append(f"The Newton steps have not converged in {share}: {', '.join(not_converged)}.")
-    if found["stress_share"] is not None:
+    if record["stress_share"] is not None:
         lines.append(
-            f"Stress: the error is {found['stress_share']:.2f} times the standard deviation of the true stress; the"
-            f" largest stress is {100 * found['largest_stress']:.0f} % off."
+            f"Stress: the error is {record['stress_share']:.2f} times the standard deviation of the true stress; the"
+            f" largest stress is {100 * record['largest_stress']:.0f} % off."
         )
-    if found.get("curve"):
-        lines.append(curve_line(found["curve"]))
-    if found["dial"]:
+    if record.get("curve"):
+        lines.append(curve_line(record["curve"]))
+    if record["dial"]:
         head = ["corrections", "Newton steps", "error", "stress", "answer", "cheapest"]
         lines += ["", "| " + " | ".join(head) + " |", "|" + " ---: |" * len(head)]
-    for turned in found["dial"]:
+    for turned in record["dial"]:
         lines.append("| " + " | ".join([
             f"{turned['corrections']}",
             f"up to {turned['newton_steps']}" if turned["newton_steps"] else "0",
             _percent(turned["relative_error"]),
             "-" if turned["stress_share"] is None else f"{turned['stress_share']:.2f}",
             f"{1000 * np.median(turned['seconds']):.0f} ms",
-            beside_solver(found["scenes"], turned["relative_error"], turned["seconds"]),
+            beside_solver(record["scenes"], turned["relative_error"], turned["seconds"]),
         ]) + " |")  # fmt: skip
     return lines
 
@@ -276,8 +276,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     study_rows(__doc__, ROWS, arguments, measured, _said, (RESULTS, PAGE), page)
 
 
-def _said(found: dict[str, Any]) -> str:
-    return f"{100 * found['relative_error']:.3g} %"
+def _said(record: dict[str, Any]) -> str:
+    return f"{100 * record['relative_error']:.3g} %"
 
 
 if __name__ == "__main__":

@@ -46,10 +46,10 @@ def phases(truth: Trajectory) -> dict[str, np.ndarray] | None:
     prescribed = truth.scene.prescribed
     travel = np.linalg.norm(truth.position[:, prescribed] - truth.position[0, prescribed], axis=2)
     deepest = int(np.argmax(travel.max(axis=1))) if prescribed.any() else truth.num_frames
-    found = {"before": frames < start, "first": (frames >= start) & (frames < start + FIRST)}
-    found["release"] = (frames > deepest) & (frames >= start + FIRST)
-    found["full"] = (frames >= start + FIRST) & ~found["release"]
-    return found
+    masks = {"before": frames < start, "first": (frames >= start) & (frames < start + FIRST)}
+    masks["release"] = (frames > deepest) & (frames >= start + FIRST)
+    masks["full"] = (frames >= start + FIRST) & ~masks["release"]
+    return masks
 
 
 def repeated(truth: Trajectory, horizons: int) -> Trajectory:
@@ -62,13 +62,13 @@ def repeated(truth: Trajectory, horizons: int) -> Trajectory:
 
 def phase_errors(truth: Trajectory, result: Answer) -> dict[str, SquaredError]:
     """Errors of the positions of NORMAL nodes in each phase; nothing where the rollout failed on the way."""
-    found, normal = phases(truth), truth.scene.node_type == NodeType.NORMAL
-    if found is None or len(result.position) < truth.num_frames:
+    masks, normal = phases(truth), truth.scene.node_type == NodeType.NORMAL
+    if masks is None or len(result.position) < truth.num_frames:
         return {}
     predicted = np.arange(truth.num_frames) >= result.given
     return {
         name: SquaredError.between(result.position[: truth.num_frames][rows], truth.position[rows], normal)
-        for name, rows in ((name, frames & predicted) for name, frames in found.items())
+        for name, rows in ((name, frames & predicted) for name, frames in masks.items())
     }
 
 
@@ -83,8 +83,8 @@ def measure(run: Run, horizons: int, command: str) -> dict[str, Any]:
     """The evaluation of a run with `phases` (for each, `rmse_sequence` and `rmse_pooled`), `diverged` (what stopped a
     long rollout, by scene) and `farthest` (the largest distance in all of them from the centre of the domain over the
     largest in the truth)."""
-    found = run.evaluate(command=command).figures.to_json()
-    del found["origin"]["data"]  # a path of this machine
+    figures = run.evaluate(command=command).figures.to_json()
+    del figures["origin"]["data"]  # a path of this machine
     errors: dict[str, list[SquaredError]] = {name: [] for name in PHASES}
     diverged, farthest, center = {}, 0.0, np.array(run.info.domain_center)
     with run.open() as dataset:
@@ -96,7 +96,7 @@ def measure(run: Run, horizons: int, command: str) -> dict[str, Any]:
             reach = [float(np.abs(p - center).max()) for p in (result.position, truth.position)]
             farthest = max(farthest, reach[0] / reach[1])
     return {
-        **found,
+        **figures,
         "parameters": run.model.num_parameters,
         "phases": {
             name: {"rmse_sequence": rmse_sequence(list_), "rmse_pooled": rmse_pooled(list_)}

@@ -43,24 +43,24 @@ def write_page(results: Path, pages: Path) -> None:
         file.stem.removeprefix("study_"): json.loads(file.read_text(encoding="utf-8"))
         for file in sorted(results.glob("study_*.json"))
     }
-    parts = [INTRODUCTION, *glance({found["study"]["title"]: found["models"] for found in studies.values()})]
-    for name, found in studies.items():
-        draw(found, pages / "study" / f"{name}.svg")
-        parts.append(section(found, name))
+    parts = [INTRODUCTION, *glance({record["study"]["title"]: record["models"] for record in studies.values()})]
+    for name, record in studies.items():
+        draw(record, pages / "study" / f"{name}.svg")
+        parts.append(section(record, name))
     if (sizes := results / "scaling.json").exists():
-        found = json.loads(sizes.read_text(encoding="utf-8"))
-        scaling_page.draw(found, pages / "study" / "scaling.svg")
-        parts.append(scaling_page.section(found))
+        record = json.loads(sizes.read_text(encoding="utf-8"))
+        scaling_page.draw(record, pages / "study" / "scaling.svg")
+        parts.append(scaling_page.section(record))
     (pages / "study.md").write_text("\n".join(parts), encoding="utf-8")
 
 
-def section(found: dict[str, Any], name: str) -> str:
+def section(record: dict[str, Any], name: str) -> str:
     """One study: what it is, who is ahead, errors, errors by phase, cost, learning rates, settings."""
-    study, models = found["study"], found["models"]
+    study, models = record["study"], record["models"]
     budget = f"{study['minutes']:g} minutes" if study["minutes"] is not None else f"{study['samples']:,} frame pairs"
     lines = [f"## {study['title']}", "", *([study["about"], ""] if study["about"] else [])]
     lines += [
-        f"{scenes(found['scenes'], study['data'])}; {budget} of training on {study['threads']} thread(s);"
+        f"{scenes(record['scenes'], study['data'])}; {budget} of training on {study['threads']} thread(s);"
         f" {seeds(models)}; {', '.join(origins(models))}.",
         "",
     ]
@@ -98,10 +98,10 @@ def seeds(models: dict[str, Any]) -> str:
 def origins(models: dict[str, Any]) -> list[str]:
     """The commits and processors of the runs, each once."""
     made = [measured(run)["origin"] for model in models.values() for run in model["runs"] if measured(run)]
-    commits = sorted({(found["commit"] or "?")[:10] for found in made})
+    commits = sorted({(record["commit"] or "?")[:10] for record in made})
     return [
         f"commit{'s' if len(commits) > 1 else ''} {', '.join(commits)}",
-        *sorted({found["processor"] for found in made}),
+        *sorted({record["processor"] for record in made}),
     ]
 
 
@@ -113,8 +113,8 @@ def measured(run: Run) -> dict[str, Any]:
 def _error(predictor: str, quantity: str, horizon: str, nodes: str, key: str, scale: float) -> Callable[[Run], Any]:
     def value(run: Run) -> float | None:
         errors = measured(run).get("errors", {}).get(quantity, {}).get(predictor, {}).get(horizon)
-        found = None if errors is None else errors[nodes][key]
-        return None if found is None else scale * found
+        error = None if errors is None else errors[nodes][key]
+        return None if error is None else scale * error
 
     return value
 
@@ -125,8 +125,8 @@ def _displacement(horizon: str, key: str = "rmse_sequence", predictor: str = "mo
 
 def _phase(name: str) -> Callable[[Run], Any]:
     def value(run: Run) -> float | None:
-        found = measured(run).get("phases", {}).get(name)
-        return None if found is None else 1e3 * found["rmse_sequence"]
+        phase = measured(run).get("phases", {}).get(name)
+        return None if phase is None else 1e3 * phase["rmse_sequence"]
 
     return value
 
@@ -181,10 +181,10 @@ def opponents(models: dict[str, Any]) -> tuple[str, str] | None:
 
 def verdict(models: dict[str, Any]) -> list[str]:
     """AST beside the best of the paper's baselines: error of the rollout and time of a frame pair."""
-    found = opponents(models)
-    if found is None:
+    pair = opponents(models)
+    if pair is None:
         return []
-    ours, best = found
+    ours, best = pair
     errors = rollout_errors(models)
     ratio = errors[ours] / errors[best]
     text = (
@@ -210,14 +210,14 @@ def glance(studies: dict[str, Any]) -> list[str]:
     }
     lines = []
     for title, models in studies.items():
-        found = opponents(models)
-        if found is None:
+        pair = opponents(models)
+        if pair is None:
             continue
         cells = []
         for value in columns.values():
-            ours, theirs = (_mean(models[name]["runs"], value) for name in found)
+            ours, theirs = (_mean(models[name]["runs"], value) for name in pair)
             cells.append(f"{number(ours)} : {number(theirs)} = **{number(ours / theirs)}**" if ours and theirs else "-")
-        lines.append(f"| {title} | {' | '.join([*found, *cells])} |")
+        lines.append(f"| {title} | {' | '.join([*pair, *cells])} |")
     if not lines:
         return []
     head = [
@@ -325,13 +325,13 @@ def divergences(models: dict[str, Any], horizons: int) -> list[str]:
     return [told, *lines, "", f"Farthest node from the centre, over the farthest of the truth: {reach}."]
 
 
-def draw(found: dict[str, Any], file: Path) -> None:
+def draw(record: dict[str, Any], file: Path) -> None:
     """Validation error over the budget spent, a line a model; thin lines are its other seeds.
 
     A step counts as long as it took when speeds were measured in turns: the clock of a run tells what ran beside, too.
     """
     figure, axes = axes_of_picture(7.2, 4.4)
-    for number_, (name, model) in enumerate(found["models"].items()):
+    for number_, (name, model) in enumerate(record["models"].items()):
         for i, run in enumerate(model["runs"]):
             minutes = run["seconds_per_step"] / 60
             points = [(minutes * p["step"], 1e3 * p["valid_rmse"]) for p in run["curve"] if p["valid_rmse"] is not None]

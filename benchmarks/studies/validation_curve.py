@@ -18,7 +18,7 @@ def validation_curve(run: Run) -> list[dict[str, float]]:
     """For each validation the `step`, the `minutes` until then, and the smallest relative errors over all numbers of
     corrections: of the `model` alone, and with `newton` steps after it."""
     minutes = minutes_per_step(run)
-    found: dict[int, dict[str, float]] = {}
+    curve: dict[int, dict[str, float]] = {}
     for record in Metrics(run.path):
         measured = [EffortErrors.from_json(one) for one in record.get("valid_by_effort", [])]
         known = [one for one in measured if one.error is not None]
@@ -26,8 +26,8 @@ def validation_curve(run: Run) -> list[dict[str, float]]:
             model = min(one.error for one in known if not one.effort.newton_steps)
             newton = min(one.error for one in known)
             step = record["step"]  # a later validation of a step replaces an earlier one
-            found[step] = {"step": step, "minutes": minutes * step, "model": model, "newton": newton}
-    return list(found.values())
+            curve[step] = {"step": step, "minutes": minutes * step, "model": model, "newton": newton}
+    return list(curve.values())
 
 
 def curve_line(curve: list[dict[str, float]]) -> str:

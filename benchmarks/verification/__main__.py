@@ -101,35 +101,35 @@ def number(value: float | None, unit: str) -> str:
     return "-" if value is None else f"{value:.6g} {unit}".strip()
 
 
-def section(problem: Problem, found: dict) -> list[str]:
+def section(problem: Problem, record: dict) -> list[str]:
     """The lines of a problem in the document."""
     lines = [f"### {problem.title}", "", problem.text, ""]
     lines += ["| quantity | expected | computed | error | tolerance | holds | tolerance from |"]
     lines += ["| --- | ---: | ---: | ---: | ---: | --- | --- |"]
-    for row in found["rows"]:
+    for row in record["rows"]:
         expected, computed = (number(row[key], row["unit"]) for key in ("expected", "computed"))
         holds = "yes" if row["holds"] else "**NO**"
         lines.append(
             f"| {row['quantity']} | {expected} | {computed} | {row['error']:.1e} | {row['tolerance']:.1e} | {holds} |"
             f" {row['source']} |".replace("<", "&lt;")
         )
-    lines += ["", *(f"{remark}\n" for remark in found["remarks"])]
+    lines += ["", *(f"{remark}\n" for remark in record["remarks"])]
     lines += [
         f"![{picture['title']}](verification/{problem.name}_{name}.svg)\n"
-        for name, picture in found["pictures"].items()
+        for name, picture in record["pictures"].items()
     ]
     return lines
 
 
-def document(found: dict[str, dict]) -> str:
+def document(records: dict[str, dict]) -> str:
     """docs/results/verification.md of the problems found."""
-    rows = [row for problem in found.values() for row in problem["rows"]]
+    rows = [row for problem in records.values() for row in problem["rows"]]
     failed = [row for row in rows if not row["holds"]]
-    made = {(entry["made"]["commit"] or "?")[:10] for entry in found.values()}
-    last = list(found.values())[-1]["made"]
-    seconds = sum(entry["seconds"] for entry in found.values())
+    made = {(entry["made"]["commit"] or "?")[:10] for entry in records.values()}
+    last = list(records.values())[-1]["made"]
+    seconds = sum(entry["seconds"] for entry in records.values())
     versions = ", ".join(f"{name} {number}" for name, number in last["versions"].items())
-    missing = [f"`{name}`" for name in PROBLEMS if name not in found]
+    missing = [f"`{name}`" for name in PROBLEMS if name not in records]
     unsolved = [f"Not solved yet at this state: {', '.join(missing)}.", ""] if missing else []
     lines = [
         INTRODUCTION,
@@ -139,11 +139,11 @@ def document(found: dict[str, dict]) -> str:
         *unsolved,
     ]
     for theme, problems in THEMES.items():
-        known = [problem for problem in problems if problem.name in found]
+        known = [problem for problem in problems if problem.name in records]
         if known:
             lines += [f"## {theme}", ""]
         for problem in known:
-            lines += section(problem, found[problem.name])
+            lines += section(problem, records[problem.name])
     return "\n".join(lines).rstrip() + "\n"
 
 

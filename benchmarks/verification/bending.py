@@ -126,16 +126,16 @@ def elastica_path(layers: int) -> tuple[list[tuple[float, float]], list[np.ndarr
     potential = DeadLoad(elasticity, np.zeros(rest.shape))
     solver = newton(potential, rest, root, tolerance=1e-6)
     middle = np.flatnonzero((height == 0.5) & (rest[:, 1] == 0))
-    found, shapes, stiffness = [], [], YOUNG * size[1] / 12
+    tips, shapes, stiffness = [], [], YOUNG * size[1] / 12
     loads = [load for load, _, _ in MATTIASSON]
     for load in range(1, 11):
         potential.force[:, 2] = load * stiffness / LENGTH**2 * share
         solver.step(solver.position)
         if load in loads:
             end = share @ (solver.position - rest) / LENGTH
-            found.append((float(end[2]), -float(end[0])))
+            tips.append((float(end[2]), -float(end[0])))
             shapes.append((solver.position[middle][:, [0, 2]] - [0, 0.5]) / LENGTH)
-    return found, shapes
+    return tips, shapes
 
 
 def elastica(layers: list[int]) -> Outcome:
@@ -144,7 +144,7 @@ def elastica(layers: list[int]) -> Outcome:
     rows, curves = [], []
     for case, (load, w, u) in enumerate(MATTIASSON):
         for what, expected, component in (("w/L", w, 0), ("u/L", u, 1)):
-            values = [found[case][component] for found, _ in paths]
+            values = [tips[case][component] for tips, _ in paths]
             order, limit = observed_order([1 / n for n in layers], values)
             uncertainty = abs(values[-1] + (values[-1] - values[-2]) / 3 - limit)
             # The elastica neither stretches nor shears. With the strains P sin(phi) / EA and P cos(phi) / (5/6 GA), w
@@ -168,7 +168,7 @@ def elastica(layers: list[int]) -> Outcome:
         curves.append(Curve(f"PL^2/EI = {load:g}", shape[:, 0], shape[:, 1], "-"))
         curves.append(Curve("Mattiasson" if load == 10 else "", np.array([1 - u]), np.array([w]), "ko"))
     n = np.array(layers)
-    errors = np.array([[abs(found[i][0] - row[1]) for found, _ in paths] for i, row in enumerate(MATTIASSON)])
+    errors = np.array([[abs(tips[i][0] - row[1]) for tips, _ in paths] for i, row in enumerate(MATTIASSON)])
     convergence = [
         Curve(f"PL^2/EI = {row[0]:g}", n, error, "o-") for row, error in zip(MATTIASSON, errors, strict=True)
     ]

@@ -50,9 +50,9 @@ def by_calculix(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
         subprocess.run([find_ccx(), "-i", "job"], cwd=folder, env=environment, check=True, stdout=subprocess.DEVNULL)
         lines = (Path(folder) / "job.dat").read_text(encoding="ascii").splitlines()
     rows = np.array([[float(word) for word in line.split()] for line in lines if line.strip()[:1].isdigit()])
-    found = rows.reshape(2, len(problem.rest), 4)
-    assert (found[:, :, 0] == np.arange(1, len(problem.rest) + 1)).all()
-    return found[0, :, 1:], np.where(problem.held, found[1, :, 1:], 0)
+    results = rows.reshape(2, len(problem.rest), 4)
+    assert (results[:, :, 0] == np.arange(1, len(problem.rest) + 1)).all()
+    return results[0, :, 1:], np.where(problem.held, results[1, :, 1:], 0)
 
 
 def _deck(problem: Problem) -> list[str]:

@@ -98,7 +98,7 @@ def uniaxial_states(stretches: list[float]) -> list[tuple[float, float, float, f
     held[:, 2] |= faces[:, 2, 1]
     rollers = Rollers(elasticity, held, rest, stiffness=YOUNG * 0.1)
     solver = newton(rollers, rest)
-    found = []
+    states = []
     for stretch in stretches:
         rollers.value[:, 2] = stretch * rest[:, 2]
         solver.step(solver.position)
@@ -106,8 +106,8 @@ def uniaxial_states(stretches: list[float]) -> list[tuple[float, float, float, f
         lateral = solver.position[faces[:, 0, 1], 0].mean() / SIZE[0]
         force = rollers.reaction(solver.state.potential)[faces[:, 2, 1], 2].sum()
         spread = np.abs(stress[2, 2] - stress[2, 2].mean()).max()
-        found.append((lateral, stress[2, 2].mean(), spread, force / (SIZE[0] * SIZE[1])))
-    return found
+        states.append((lateral, stress[2, 2].mean(), spread, force / (SIZE[0] * SIZE[1])))
+    return states
 
 
 def uniaxial() -> Outcome:
@@ -129,7 +129,7 @@ def uniaxial() -> Outcome:
     s, sigma = uniaxial_closed_form(line)
     points.sort()
     x = np.array([stretch for stretch, _ in points])
-    found = np.array([state for _, state in points])
+    states = np.array([state for _, state in points])
     picture = Picture(
         "Uniaxial tension and pressure, Ciarlet's law, nu = 0.4",
         "stretch",
@@ -137,8 +137,8 @@ def uniaxial() -> Outcome:
         [
             Curve("Cauchy, closed form", line, sigma / YOUNG, "k-"),
             Curve("nominal, closed form", line, sigma * s / YOUNG, "k--"),
-            Curve("Cauchy, computed", x, found[:, 1] / YOUNG, "o"),
-            Curve("nominal, computed", x, found[:, 3] / YOUNG, "s"),
+            Curve("Cauchy, computed", x, states[:, 1] / YOUNG, "o"),
+            Curve("nominal, computed", x, states[:, 3] / YOUNG, "s"),
         ],
     )
     return Outcome(rows, {"stress": picture})

@@ -114,7 +114,7 @@ def indent(
     area = nodal_areas(soil, top, np.ones(len(soil), bool))
     surface = np.unique(top)
     centre = int(np.argmin(np.linalg.norm(soil, axis=1)))
-    found = []
+    results = []
     for depth in depths:
         target = rest.copy()
         target[far] += boussinesq(rest[far], force_at(depth))
@@ -122,7 +122,7 @@ def indent(
         solver.step(target)
         position = rollers.seen(solver.position)
         force = solver.state.contact.gradient()[:, 2]
-        found.append(
+        results.append(
             Indentation(
                 depth=-position[centre, 2],
                 gap=-depth - position[centre, 2],
@@ -135,7 +135,7 @@ def indent(
                 iterations=solver.iterations,
             )
         )
-    return found
+    return results
 
 
 def _on_axis(elasticity: Elasticity, position: np.ndarray, rest: np.ndarray) -> dict[str, np.ndarray]:

@@ -205,7 +205,7 @@ def _axis_picture(end: Indentation, p0: float, a: float) -> Picture:
     axial = -1 / (1 + (z / a) ** 2)
     radial = -(1 + POISSON) * (1 - z / a * np.arctan(a / z)) + 0.5 / (1 + (z / a) ** 2)
     deep = end.axis_depth < 3
-    found = end.axis_stress[deep] / p0
+    stress = end.axis_stress[deep] / p0
     return Picture(
         "Hertz: stress below the centre",
         "depth / a",
@@ -213,8 +213,8 @@ def _axis_picture(end: Indentation, p0: float, a: float) -> Picture:
         [
             Curve("sigma_z", z, axial, "k-"),
             Curve("sigma_r", z, radial, "k--"),
-            Curve("sigma_z computed", end.axis_depth[deep], found[:, 2, 2], "o"),
-            Curve("sigma_r computed", end.axis_depth[deep], (found[:, 0, 0] + found[:, 1, 1]) / 2, "s"),
+            Curve("sigma_z computed", end.axis_depth[deep], stress[:, 2, 2], "o"),
+            Curve("sigma_r computed", end.axis_depth[deep], (stress[:, 0, 0] + stress[:, 1, 1]) / 2, "s"),
         ],
     )
 

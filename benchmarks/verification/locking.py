@@ -88,7 +88,7 @@ def table(what: str, sizes: tuple, shares: dict[str, np.ndarray]) -> str:
     """Figures of all elements, relative to the expected one, as a table of the page."""
     head = ["elements", *(f"{n} {what}" for n in sizes)]
     lines = [head, ["---", *["---:"] * len(sizes)]]
-    lines += [[kind, *(f"{share:.3f}" for share in found)] for kind, found in shares.items()]
+    lines += [[kind, *(f"{share:.3f}" for share in values)] for kind, values in shares.items()]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
@@ -114,13 +114,13 @@ def shape_factor_modulus(poisson: float) -> float:
 def rubber() -> Outcome:
     expected, meshes = shape_factor_modulus(0.499), ((6, 6, 2), (10, 10, 3))
     names = tuple("x".join(map(str, cells)) for cells in meshes)
-    found = {kind: [pad_stress(kind, cells) for cells in meshes] for kind in ELEMENTS}
+    moduli = {kind: [pad_stress(kind, cells) for cells in meshes] for kind in ELEMENTS}
     rows = []
-    for name, ours, theirs in zip(names, found["second-order"], found["C3D20R"], strict=True):
+    for name, ours, theirs in zip(names, moduli["second-order"], moduli["C3D20R"], strict=True):
         limit = "the limit of this page: 10 %"
         rows.append(relative(f"second-order, {name} cells: modulus / E, formula", expected, ours, 0.1, limit))
         rows.append(relative(f"second-order, {name} cells: modulus / E, C3D20R", theirs, ours, 0.1, limit))
-    shares = {kind: np.divide(values, expected) for kind, values in found.items()}
+    shares = {kind: np.divide(values, expected) for kind, values in moduli.items()}
     return Outcome(rows, {}, [table("cells", names, shares)])
 
 
@@ -164,13 +164,13 @@ def edge_weights(kind: str, elements: np.ndarray, on_face: np.ndarray, rest: np.
 
 def cook() -> Outcome:
     sizes, rows, remarks = (4, 8, 16), [], []
-    found = {kind: [cook_tip(kind, n, 1 / 3, False) for n in sizes] for kind in ELEMENTS}
+    rises = {kind: [cook_tip(kind, n, 1 / 3, False) for n in sizes] for kind in ELEMENTS}
     source = "the limit of this page: 10 %"
-    rows.append(relative("nu = 1/3, second-order, 4 cells: rise", 23.96, found["second-order"][0], 0.1, source))
+    rows.append(relative("nu = 1/3, second-order, 4 cells: rise", 23.96, rises["second-order"][0], 0.1, source))
     source = "tolerance of 4 cells / 4^1.5: the stress is singular at a clamped corner"
-    rows.append(relative("nu = 1/3, second-order, 16 cells: rise", 23.96, found["second-order"][-1], 0.0125, source))
-    rows += same_as_calculix(sizes, found["second-order"], found["C3D10"], "cells")
-    remarks.append("Plane stress, nu = 1/3, relative to 23.96:\n\n" + table("cells", sizes, divided(found, 23.96)))
+    rows.append(relative("nu = 1/3, second-order, 16 cells: rise", 23.96, rises["second-order"][-1], 0.0125, source))
+    rows += same_as_calculix(sizes, rises["second-order"], rises["C3D10"], "cells")
+    remarks.append("Plane stress, nu = 1/3, relative to 23.96:\n\n" + table("cells", sizes, divided(rises, 23.96)))
     rubber = {kind: [cook_tip(kind, n, 0.4999, True) for n in sizes] for kind in ELEMENTS}
     limit = cook_tip("C3D20R", 32, 0.4999, True)
     source = "the limit of this page: 10 %"
@@ -182,8 +182,8 @@ def cook() -> Outcome:
     return Outcome(rows, {}, remarks)
 
 
-def divided(found: dict[str, list[float]], by: float) -> dict[str, np.ndarray]:
-    return {kind: np.divide(values, by) for kind, values in found.items()}
+def divided(figures: dict[str, list[float]], by: float) -> dict[str, np.ndarray]:
+    return {kind: np.divide(values, by) for kind, values in figures.items()}
 
 
 def step_seconds(kind: str, cells: tuple[int, int, int]) -> tuple[int, float]:

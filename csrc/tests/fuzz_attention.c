@@ -1,6 +1,6 @@
 /* Fuzzes attention and its gradients: a scene alone gives the bits that it gives in its batch, rows apart give the bits
- * of dense rows. Where the scores are moderate, results agree with the formula in double within the rounding of the
- * scores, and are not finite where the formula is not. */
+ * of contiguous rows. Where the scores are moderate, results agree with the formula in double within the rounding of
+ * the scores, and are not finite where the formula is not. */
 #define main tests_of_attention
 #include "test_attention.c"
 #undef main
@@ -33,7 +33,7 @@ static bool same_apart(const float *got, const float *x, int64_t rows, int64_t n
 }
 
 /* Rows of q, k and v, and of their gradients, `gap` floats more apart. */
-static void check_strides(const ast_kernels *kernels, const problem *a, const answer *dense, int64_t gap) {
+static void check_strides(const ast_kernels *kernels, const problem *a, const answer *contiguous, int64_t gap) {
   const int64_t row = a->H * a->D, stride = row + gap;
   ast_attention s = sizes_of(a);
   s.q_stride = s.k_stride = s.v_stride = s.dq_stride = s.dk_stride = s.dv_stride = stride;
@@ -42,9 +42,10 @@ static void check_strides(const ast_kernels *kernels, const problem *a, const an
   problem wide = *a; /* with room for gradients of such rows */
   wide.Tq += a->Tq * gap / row + 1, wide.Tk += a->Tk * gap / row + 1;
   answer r = solve_rows(kernels, &wide, s, q, k, v);
-  CHECK(same_floats(r.out, dense->out, a->Tq * row) && same_floats(r.maximum, dense->maximum, a->Tq * a->H) &&
-            same_floats(r.sum, dense->sum, a->Tq * a->H) && same_apart(r.dq, dense->dq, a->Tq, row, stride) &&
-            same_apart(r.dk, dense->dk, a->Tk, row, stride) && same_apart(r.dv, dense->dv, a->Tk, row, stride),
+  CHECK(same_floats(r.out, contiguous->out, a->Tq * row) && same_floats(r.maximum, contiguous->maximum, a->Tq * a->H) &&
+            same_floats(r.sum, contiguous->sum, a->Tq * a->H) && same_apart(r.dq, contiguous->dq, a->Tq, row, stride) &&
+            same_apart(r.dk, contiguous->dk, a->Tk, row, stride) &&
+            same_apart(r.dv, contiguous->dv, a->Tk, row, stride),
         "rows %lld floats apart differ", (long long)gap);
   FREE(q, k, v);
   free_answer(r);

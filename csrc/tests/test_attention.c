@@ -313,7 +313,7 @@ static void test_row_strides(const ast_kernels *kernels) {
     memcpy(fused + i * 3 * row + row, a.k + i * row, (size_t)row * sizeof(float));
     memcpy(fused + i * 3 * row + 2 * row, a.v + i * row, (size_t)row * sizeof(float));
   }
-  answer dense = solve(kernels, &a), sliced = new_answer(&a);
+  answer contiguous = solve(kernels, &a), sliced = new_answer(&a);
   float *gradient = new_floats(tokens * 3 * row);
   ast_attention s = sizes_of(&a);
   s.q_stride = s.k_stride = s.v_stride = s.dq_stride = s.dk_stride = s.dv_stride = 3 * row;
@@ -322,15 +322,15 @@ static void test_row_strides(const ast_kernels *kernels) {
   CHECK(kernels->attention_backward(&s, fused, fused + row, fused + 2 * row, sliced.out, sliced.maximum, sliced.sum,
                                     a.dout, gradient, gradient + row, gradient + 2 * row) == AST_OK,
         "status");
-  CHECK(same_bits(dense.out, sliced.out, tokens * row), "strides change the result");
+  CHECK(same_bits(contiguous.out, sliced.out, tokens * row), "strides change the result");
   for (int64_t i = 0; i < tokens; i++) {
     const float *d = gradient + i * 3 * row;
-    CHECK(same_bits(dense.dq + i * row, d, row) && same_bits(dense.dk + i * row, d + row, row) &&
-              same_bits(dense.dv + i * row, d + 2 * row, row),
+    CHECK(same_bits(contiguous.dq + i * row, d, row) && same_bits(contiguous.dk + i * row, d + row, row) &&
+              same_bits(contiguous.dv + i * row, d + 2 * row, row),
           "strides change the gradients of row %lld", (long long)i);
   }
   FREE(gradient, fused);
-  free_answer(dense), free_answer(sliced), free_problem(a);
+  free_answer(contiguous), free_answer(sliced), free_problem(a);
 }
 
 static void test(const ast_kernels *kernels) {

@@ -135,7 +135,7 @@ static void test_same_bits_on_threads(const ast_kernels *kernels) {
 static void test_strides_and_absent_arrays(const ast_kernels *kernels) {
   const int64_t M = 100, I = 20, O = 18, apart = 50;
   problem a = new_problem(M, I, O, AST_RELU, 1);
-  answer dense = solve(kernels, &a, false);
+  answer contiguous = solve(kernels, &a, false);
   float *wide = new_floats(M * apart);
   for (int64_t i = 0; i < M; i++) {
     memcpy(wide + i * apart, a.x + i * I, (size_t)I * sizeof *wide);
@@ -148,20 +148,20 @@ static void test_strides_and_absent_arrays(const ast_kernels *kernels) {
   float *dx = new_floats(M * I), *dweight = new_floats(O * I), *dbias = new_floats(O), *out = new_floats(M * O);
   READ_ONLY(wide, weights, a.bias, a.residual);
   CHECK(kernels->linear(&s, wide, weights, a.bias, a.residual, out, NULL) == AST_OK, "status");
-  CHECK(same_bits(out, dense.of[0], M * O), "strides change the result");
+  CHECK(same_bits(out, contiguous.of[0], M * O), "strides change the result");
   CHECK(kernels->linear_backward(&s, wide + I, wide, weights, a.bias, NULL, dx, NULL, NULL) == AST_OK, "status");
-  CHECK(same_bits(dx, dense.of[1], M * I), "dx alone");
+  CHECK(same_bits(dx, contiguous.of[1], M * I), "dx alone");
   CHECK(kernels->linear_backward(&s, wide + I, wide, weights, a.bias, NULL, NULL, dweight, NULL) == AST_OK, "status");
-  CHECK(same_bits(dweight, dense.of[2], O * I), "dweight alone");
+  CHECK(same_bits(dweight, contiguous.of[2], O * I), "dweight alone");
   CHECK(kernels->linear_backward(&s, wide + I, wide, weights, a.bias, NULL, NULL, NULL, dbias) == AST_OK, "status");
-  CHECK(same_bits(dbias, dense.of[3], O), "dbias alone");
+  CHECK(same_bits(dbias, contiguous.of[3], O), "dbias alone");
   WRITABLE(a.bias, a.residual);
   memset(a.bias, 0, (size_t)O * sizeof *a.bias), memset(a.residual, 0, (size_t)(M * O) * sizeof *a.residual);
   answer zero = solve(kernels, &a, false);
   CHECK(kernels->linear(&s, wide, weights, NULL, NULL, out, NULL) == AST_OK, "status");
   CHECK(same_bits(out, zero.of[0], M * O), "without bias and residual");
   FREE(wide, weights, dx, dweight, dbias, out);
-  free_answer(dense), free_answer(zero), free_problem(a);
+  free_answer(contiguous), free_answer(zero), free_problem(a);
 }
 
 /* A row that is not finite touches no other; the padding never shows. */

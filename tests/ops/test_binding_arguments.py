@@ -225,9 +225,9 @@ def test_tensors_of_all_kinds_are_read(change):
 @pytest.mark.parametrize(
     "change, message",
     [
-        (lambda x: x.to_sparse(), "must be a dense tensor on the CPU"),
-        (lambda x: x.to("meta"), "must be a dense tensor on the CPU"),
-        (lambda x: FakeTensorMode().from_tensor(x), "must be a dense tensor on the CPU"),
+        (lambda x: x.to_sparse(), "must be a strided tensor on the CPU"),
+        (lambda x: x.to("meta"), "must be a strided tensor on the CPU"),
+        (lambda x: FakeTensorMode().from_tensor(x), "must be a strided tensor on the CPU"),
         (lambda x: x.double(), "must be float32, not torch.float64"),
         (lambda x: x.bfloat16(), "must be float32, not torch.bfloat16"),
         (lambda x: x.to(torch.complex64), "must be float32, not torch.complex64"),

@@ -5,7 +5,7 @@ import torch
 
 from ast_sim.ops.spec import Spec, check
 
-TEXT = """x[M,I] rows, offsets[B+1] offsets(M), bias?[4O] with(scale), scale?[O], mean flag;
+TEXT = """x[M,I] rows_apart, offsets[B+1] offsets(M), bias?[4O] with(scale), scale?[O], mean flag;
           num size(R), save switch, wanted wants(x,bias)
           -> y[R,I+O], index[B] int64, kept[M] if(save,bias), dbias[4O] if(wanted)"""
 SPEC = Spec(TEXT)

@@ -19,7 +19,10 @@ class Section:
         self.name_of_variant = name
         self.name = {"ParametricNodes": "Nodes", "NOD": "Nodes", "ELM": "Elements"}.get(name, name)
         self.end_mark = f"${'End' if version > 1 else 'END'}{name}".encode()
-        self.content, self.place, self.version, self.order = content, place, version, order
+        self.content = content
+        self.place = place
+        self.version = version
+        self.order = order
         self.tokens: list[bytes] | None = None
         self.next_token = 0
         self.end = -1

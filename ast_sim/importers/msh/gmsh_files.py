@@ -171,7 +171,8 @@ def _nodes_4(section: Section, content: _Content) -> None:
             rows = section.reals(columns * count).reshape(count, columns)
         numbers.append(block_numbers)
         points.append(rows[:, :3])
-    content.node_numbers, content.points = np.concatenate(numbers), np.concatenate(points)
+    content.node_numbers = np.concatenate(numbers)
+    content.points = np.concatenate(points)
     if len(content.node_numbers) != total:
         raise ValueError(f"it says that it holds {counted(total, 'node')}, but there are {len(content.node_numbers):,}")
 

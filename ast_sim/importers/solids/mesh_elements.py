@@ -77,7 +77,9 @@ def elements_of(mesh: SourceMesh, point_of: np.ndarray, corners: bool = False) -
             kind = "triangles" if shape == "quad" else "tetrahedra"
             are = counted(len(cells), f"cell of the kind {shape} is", f"cells of the kind {shape} are")
             told.append(f"{are} cut into {len(cut):,} {kind}")
-            cells, middle, row = cut, middle[owner], row[owner]
+            cells = cut
+            middle = middle[owner]
+            row = row[owner]
         nodes.append(cells)
         middles.append(middle)
         rows.append(row)

@@ -46,7 +46,8 @@ class Stitching:
 
     def _candidates(self) -> str:
         """Find the pairs of points that may be one; why they may: "ids", "cut", "pieces", "patches", "parts" or ""."""
-        mesh, points = self.mesh, self.mesh.points
+        mesh = self.mesh
+        points = self.mesh.points
         used = np.unique(np.concatenate([np.zeros(0, np.int64), *(block.nodes.ravel() for block in self.blocks)]))
         if not len(used):
             return ""

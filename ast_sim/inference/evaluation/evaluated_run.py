@@ -103,8 +103,10 @@ class Evaluation:
         return report.ReportScene(name, label, truth, dataclasses.replace(answer, info=self.run.info).trajectory)
 
     def _facts(self, dataset: Dataset, metrics: Sequence[dict[str, Any]]) -> dict[str, str]:
-        run, info = self.run, dataset.info
-        training, model = run.settings.train, run.settings.model
+        run = self.run
+        info = dataset.info
+        training = run.settings.train
+        model = run.settings.model
         facts = {
             "Model": f"{type(run.model).__name__}, {run.model.num_parameters:,} parameters",
             **model.facts(info.length_unit),

@@ -65,7 +65,8 @@ class JumpingFrame:
 
     def begin(self) -> None:
         """Make the start, when the source is predicted."""
-        scene, source = self.scene, self.source
+        scene = self.scene
+        source = self.source
         if source is None:
             state = scene.state(scene.question.prescribed_position[0], scene.fields[0], self.number)
         elif source.failure is None:

@@ -55,7 +55,9 @@ class _RollingScene:
     """A scene during its rollout: its graph, its motion and the frames so far."""
 
     def __init__(self, model: Simulator, question: Question, given: int) -> None:
-        self.model, self.config, self.question = model, model.config, question
+        self.model = model
+        self.config = model.config
+        self.question = question
         self.graph = model.graph(question.scene)
         self.prescribed_position = torch.tensor(question.prescribed_position)
         self.end = max(question.wanted()) + 1

@@ -91,14 +91,18 @@ class MembraneState:
 
     def __init__(self, strain: np.ndarray, material: ClothMaterial) -> None:
         self.material = material
-        mu, lam, nu, share = material.mu, material.lam, material.poisson, material.compression
+        mu = material.mu
+        lam = material.lam
+        nu = material.poisson
+        share = material.compression
         e11, e22, e12 = strain
         pressure = lam * (e11 + e22)
         plain = np.stack([2 * mu * e11 + pressure, 2 * mu * e22 + pressure, 2 * mu * e12])
         density = 0.5 * (plain[0] * e11 + plain[1] * e22 + 2 * plain[2] * e12)
         mean = (e11 + e22) / 2
         radius = np.hypot((e11 - e22) / 2, e12)
-        self._large, self._small = mean + radius, mean - radius
+        self._large = mean + radius
+        self._small = mean - radius
         self._taut = self._small > -nu * self._large
         self._wrinkled = ~self._taut & (self._large > 0)
         # Double angle of the first principal direction: cosine and sine.
@@ -116,7 +120,8 @@ class MembraneState:
         Where the sheet is wrinkled, it is Y n n^T (x) n n^T plus the shear Y e1 / (2 (e1 - e2)), because n turns.
         """
         material = self.material
-        mu, lam = material.mu, material.lam
+        mu = material.mu
+        lam = material.lam
         plain = np.array([[lam + 2 * mu, lam, 0], [lam, lam + 2 * mu, 0], [0, 0, mu]])
         weight = np.where(self._taut, 1.0, material.compression)
         result = plain[:, :, None] * weight
@@ -232,7 +237,8 @@ class Cloth:
         entries += B[1][_ROW] * CB[1][_COLUMN]
         entries += B[2][_ROW] * CB[2][_COLUMN]
         s11, s22, s12 = positive_part(state.membrane.stress) if project else state.membrane.stress
-        (left1, left2), (right1, right2) = self._pair_gradients, self._pair_columns
+        left1, left2 = self._pair_gradients
+        right1, right2 = self._pair_columns
         entries[_SAME_COMPONENT] += left1 * (s11 * right1 + s12 * right2) + left2 * (s12 * right1 + s22 * right2)
         return np.concatenate([entries.ravel(), self._bending_values])
 

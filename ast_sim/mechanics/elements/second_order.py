@@ -127,7 +127,8 @@ class SecondOrder(Elasticity):
 
     def element_forces(self, deformation: Deformation) -> np.ndarray:
         """Derivative of each element's energy by its nodes [30,E], in newton."""
-        J, cofactors = deformation.J, deformation.cofactor
+        J = deformation.J
+        cofactors = deformation.cofactor
         P = self.material.first_piola(deformation.F, J, cofactors / J) + self._mean_pressure(J) * cofactors
         at_points = np.einsum("ijp,ajp->aip", P * self.volume, self.gradients)
         return self._summed(at_points).reshape(30, -1)

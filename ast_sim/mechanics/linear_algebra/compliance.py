@@ -22,7 +22,9 @@ COLUMNS, NUMBERS = 64, 2**23  # right sides that are solved for together: 64, or
 ROUNDING = 1e-10  # is added to the diagonal of B, relative to its mean: equal pairs make B singular
 # What condensation costs, in columns (docs/log.md, 2026-11-28): 70 for a new symbolic factorization, and one for each
 # 1,000 multiplications of dense matrices per eliminated unknown. About a third of the directions is wanted.
-ANALYSIS, MULTIPLICATIONS, WANTED = 70, 1000, 1 / 3
+ANALYSIS = 70
+MULTIPLICATIONS = 1000
+WANTED = 1 / 3
 
 _cholesky, _inverse_of_factor = get_lapack_funcs(("potrf", "potri"))
 
@@ -99,7 +101,9 @@ class ByColumns:
     is_whole = False
 
     def __init__(self, factor: Factorization, directions: scipy.sparse.csr_array, watch: Callable[[int], None]) -> None:
-        self._factor, self._directions, self._watch = factor, directions, watch
+        self._factor = factor
+        self._directions = directions
+        self._watch = watch
         self._unknowns = directions.shape[1]  # pyright: ignore[reportOptionalSubscript], of scipy
         self._parts: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []  # unknowns, lefts and rights of some columns
         self._products = np.zeros((0, 0))
@@ -158,8 +162,11 @@ class ByCondensation:
         directions: scipy.sparse.csr_array,
         watch: Callable[[int], None],
     ) -> None:
-        self._factor, self._touched, self._inverse = factor, touched, inverse
-        self._directions, self._watch = directions, watch
+        self._factor = factor
+        self._touched = touched
+        self._inverse = inverse
+        self._directions = directions
+        self._watch = watch
         on_touched = directions[:, touched]
         products = on_touched @ (on_touched @ inverse).T
         self._products = (products + products.T) / 2

@@ -149,7 +149,8 @@ class Cholmod:
     def factorise(self, upper: scipy.sparse.csr_array, is_new_pattern: bool) -> bool:
         import cholespy
 
-        solver, kind = cholespy.CholeskySolverD, cholespy.MatrixType  # pyright: ignore[reportAttributeAccessIssue], of C++
+        solver = cholespy.CholeskySolverD  # pyright: ignore[reportAttributeAccessIssue], of C++
+        kind = cholespy.MatrixType  # pyright: ignore[reportAttributeAccessIssue], of C++
         whole = (upper + scipy.sparse.triu(upper, 1).T).tocsc()
         try:
             self._solver = solver(

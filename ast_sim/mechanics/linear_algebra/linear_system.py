@@ -55,7 +55,8 @@ def conjugate_gradients(
         if np.linalg.norm(residual) <= goal:
             return solution, False
         preconditioned = precondition(residual)
-        product, before = residual @ preconditioned, product
+        before = product
+        product = residual @ preconditioned
         direction = preconditioned + product / before * direction
     return None, False
 
@@ -79,7 +80,8 @@ class LinearSystem:
         self._entries = entries
         sparsity = Sparsity(entries, self._number[::3] // 3)  # -1 stays -1
         rows = np.repeat(np.arange(self._count), np.diff(sparsity.starts))
-        self._own, self._slot = rows * self._count + sparsity.columns, sparsity.slot
+        self._own = rows * self._count + sparsity.columns
+        self._slot = sparsity.slot
         self._factorization = factorization()
         self.factorizations = 0
         self._has_factor = False

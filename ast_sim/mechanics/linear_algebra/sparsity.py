@@ -89,7 +89,8 @@ class _Pairs:
         nodes = np.stack([entries.rows // 3, entries.columns // 3])
         (one, other), self._pair = np.unique(nodes, axis=1, return_inverse=True)
         of_node = number.astype(np.int32)[entries.nodes]
-        self._one, self._other = of_node[one], of_node[other]
+        self._one = of_node[one]
+        self._other = of_node[other]
         self.low = np.minimum(self._one, self._other)
         self.high = np.maximum(self._one, self._other)
 
@@ -98,7 +99,8 @@ class _Pairs:
         inside = self.low >= 0
         low = np.where(inside, self.low, 0)
         block = blocks[low.ravel(), np.where(inside, self.high, 0).ravel()].reshape(low.shape)
-        corner, width = corner.astype(np.int32)[block], width.astype(np.int32)[low]
+        corner = corner.astype(np.int32)[block]
+        width = width.astype(np.int32)[low]
         exchanged = self._one > self._other
         slot = np.empty((len(self._pair), low.shape[1]), np.int32)
         for entry, (pair, i, j) in enumerate(zip(self._pair, *self._components, strict=True)):

@@ -68,7 +68,9 @@ class ContactForces:
     """
 
     def __init__(self, scene: Scene, contact_range: float, friction: float) -> None:
-        self._scene, self._range, self._friction = scene, contact_range, friction
+        self._scene = scene
+        self._range = contact_range
+        self._friction = friction
         of_soft = np.isin(np.arange(scene.num_nodes), scene.elements[~scene.rigid_elements])
         self.free = np.flatnonzero(np.repeat(of_soft & ~scene.prescribed, 3))
 

@@ -47,7 +47,8 @@ MORE = 16  # or this part of all that were taken before, if that is more
 YIELDING = 1e-5  # contact yields by this share of what the bodies do, so that pairs that say the same share a force
 ROUNDED = 1e-12  # an overlap of this part of the deepest is rounding
 PATIENCE, MOST_PIVOTS = 3, 30  # turns of all wrong pairs without fewer of them; turns in all, for each pair
-SWEEPS, CHANGE = 100, 1e-3  # forces of friction are found when a sweep over the pairs changes them by less
+SWEEPS = 100  # over the pairs, at most
+CHANGE = 1e-3  # forces of friction are found when a sweep changes them by less
 TINY = 1e-300  # instead of zero in a denominator
 STILL = 0.05  # a step of this size (`NewtonSteps.size`) or less is the last one (docs/log.md, 2026-11-25)
 SLIGHT = 1e-3  # a displacement below this, in mean edge lengths, is none: before bodies touch, only rounding is left
@@ -74,7 +75,9 @@ class NewtonSteps:
     """
 
     def __init__(self, scene: Scene, material: NeoHookean, clearance: float, friction: float = 0.0) -> None:
-        self._scene, self._clearance, self._friction = scene, clearance, friction
+        self._scene = scene
+        self._clearance = clearance
+        self._friction = friction
         self._rest = scene.rest_position.astype(np.float64)
         self._deforming = np.flatnonzero(~scene.rigid_elements)
         self.elasticity = deforming_body(scene, self._deforming, material)
@@ -211,7 +214,8 @@ def _pressed(compliance: np.ndarray, offset: np.ndarray) -> np.ndarray:
     compliance = compliance + YIELDING * compliance.diagonal().mean() * np.eye(len(compliance))
     pressing = offset < 0
     slack = ROUNDED * np.abs(offset).max()
-    fewest, patience = len(offset) + 1, PATIENCE
+    fewest = len(offset) + 1
+    patience = PATIENCE
     for _ in range(MOST_PIVOTS * len(offset)):
         rows = np.flatnonzero(pressing)
         forces = np.zeros(len(offset))

@@ -102,7 +102,8 @@ def _near(one: PlacedEdges, other: PlacedEdges, distance: float) -> tuple[Placed
     sharp, theirs = np.flatnonzero(one.sharp), np.flatnonzero(other.sharp)
     rows = []
     for mine, others in ((sharp, np.arange(len(other.nodes))), (np.flatnonzero(~one.sharp), theirs)):
-        ends, facing = one.ends[mine], other.ends[others]
+        ends = one.ends[mine]
+        facing = other.ends[others]
         near = near_boxes(ends.min(axis=1), ends.max(axis=1), facing.min(axis=1), facing.max(axis=1), distance)
         rows.append((mine[near[0]], others[near[1]]))
     first, second = (np.concatenate(numbers) for numbers in zip(*rows, strict=True))

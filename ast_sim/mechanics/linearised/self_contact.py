@@ -30,7 +30,9 @@ class SelfContact:
     """
 
     def __init__(self, faces: np.ndarray, rest: np.ndarray, length: float) -> None:
-        self._faces, self._rest, self._apart = faces, rest, APART * length
+        self._faces = faces
+        self._rest = rest
+        self._apart = APART * length
         self._nodes = np.unique(faces)
         self._outward = node_normals(rest, faces)
         sides = rest[triangle_sides(faces)]

@@ -86,7 +86,10 @@ class ASTConfig(ProximityConfig):
         """See `ProximityConfig`. An unset L_cell follows from the mesh spacing. Dynamic scenes get no exchanges:
         with them, rollouts of cloths diverged in one of two trainings (docs/log.md, 2026-11-24)."""
         resolved = super().resolve(facts)
-        depth, elements, places, exchanges = self.L_cell, self.element_inputs, self.places, self.exchanges
+        depth = self.L_cell
+        elements = self.element_inputs
+        places = self.places
+        exchanges = self.exchanges
         if depth is None:
             side = (self.cell_spacings or CELL_SPACINGS) * facts.mesh_spacing
             depth = min(max(round(1 + math.log2(resolved.data.domain_half_width / side)), self.l_ocnn + 1), 21)

@@ -29,12 +29,15 @@ class MessagePassing(nn.Module):
 
     def __init__(self, config: ASTConfig, edge_inputs: int, residual: bool):
         super().__init__()
-        hidden, factorized = config.hidden, config.factorized
-        self.hidden, self.residual = hidden, residual
+        hidden = config.hidden
+        factorized = config.factorized
+        self.hidden = hidden
+        self.residual = residual
         self.edge_encoder = MLP(edge_inputs, hidden, hidden, factorized) if edge_inputs else None
         self.f_e = MLP((3 if edge_inputs else 2) * hidden, hidden, hidden, factorized)
         self.f_v = MLP(2 * hidden, hidden, hidden, factorized)
-        self.norm_e, self.norm_v = nn.LayerNorm(hidden), nn.LayerNorm(hidden)
+        self.norm_e = nn.LayerNorm(hidden)
+        self.norm_v = nn.LayerNorm(hidden)
 
     def forward(
         self, edges: EdgeSet, senders: Tensor, receivers: Tensor, edge_features: Tensor | None = None
@@ -44,7 +47,8 @@ class MessagePassing(nn.Module):
         constant = self.f_e.first.bias
         encoder = None
         if self.edge_encoder is not None:
-            first, last = self.edge_encoder.first, self.edge_encoder.second
+            first = self.edge_encoder.first
+            last = self.edge_encoder.second
             encoder = (first.weight, first.bias, of_edge[0] @ last.weight)
             constant = torch.addmv(constant, of_edge[0], last.bias)
         total = message_sum(

@@ -37,7 +37,8 @@ class AST(Simulator):
 
     def __init__(self, config: ASTConfig):
         super().__init__(config)
-        c, width = config, config.hidden
+        c = config
+        width = config.hidden
         self.node_inputs = normalizer_of(c, "node")
         self.edge_inputs = normalizer_of(c, "edge")
         self.node_encoder = MLP(self.node_inputs.width, width, width, c.factorized)
@@ -47,7 +48,8 @@ class AST(Simulator):
             self.e2m = self._message_passing("e2m", self.edge_inputs.width)
         else:
             self.m2m = self._message_passing("m2m", self.edge_inputs.width)
-        self.before_cells, self.after_cells = self._mesh_steps(), self._mesh_steps()
+        self.before_cells = self._mesh_steps()
+        self.after_cells = self._mesh_steps()
         self.m2c = self._message_passing("m2c")
         self.down = nn.ModuleList(SparseConv(width, up=False) for _ in range(c.l_ocnn))
         self.lift = Linear(width, c.d_token)
@@ -86,7 +88,9 @@ class AST(Simulator):
 
     def inputs_of(self, batch: Batch, use: Use = Normalizer.__call__) -> tuple[Tensor, Tensor, Tensor | None]:
         """See `Simulator`: of the nodes, the edges, and the elements, if they are nodes of the graph."""
-        config, graph, now = self.config, batch.graph, batch.position
+        config = self.config
+        graph = batch.graph
+        now = batch.position
         elements = None
         senders = now
         if config.element_inputs:
@@ -128,7 +132,8 @@ class AST(Simulator):
 
     def _embedded(self, cells: Cells, mesh: Tensor) -> Vectors:
         """Mesh features [N, hidden] -> the coarsest cells [C, d_token] with their places."""
-        finest, coarsest = cells.finest, cells.coarsest
+        finest = cells.finest
+        coarsest = cells.coarsest
         mean = segment_mean(mesh, finest.node_order, finest.node_offsets)
         x = self.m2c(cells.from_mesh(), mesh, mean)
         for convolve, step in zip(self.down, cells.maps, strict=True):

@@ -59,7 +59,8 @@ class AttentionBlock(nn.Module):
     def __init__(self, config: ASTConfig, width: int, context: int | None = None):
         super().__init__()
         inner = config.heads * config.head_dim
-        self.heads, self.dropout = config.heads, config.dropout
+        self.heads = config.heads
+        self.dropout = config.dropout
         self.norm = nn.LayerNorm(width)
         if context is None:
             self.query_key_value = Linear(width, 3 * inner, bias=False)
@@ -82,10 +83,13 @@ class AttentionBlock(nn.Module):
     def _at_once(self, vectors: Vectors, context: Vectors) -> Tensor:
         """[T, width]: the same in one call, which has neither dropout nor a gradient by the rotations."""
         if vectors is context:
-            norm_context, inner = self.norm, self.query_key_value.out_features // 3
+            norm_context = self.norm
+            inner = self.query_key_value.out_features // 3
             query, key_value = self.query_key_value.weight.split((inner, 2 * inner))
         else:
-            norm_context, query, key_value = self.norm_context, self.query.weight, self.key_value.weight
+            norm_context = self.norm_context
+            query = self.query.weight
+            key_value = self.key_value.weight
         layers = (self.out, self.feed_forward.norm, self.feed_forward.first, self.feed_forward.second)
         parameters = (
             *_of(self.norm),

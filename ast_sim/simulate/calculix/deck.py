@@ -106,7 +106,8 @@ def _materials(case: SolidCase) -> Iterator[str]:
     scene = case.scene
     body = scene.body[scene.elements[:, 0]]
     constants = np.empty((scene.num_elements, 3))
-    constants[:, 0], constants[:, 1] = case.material.young, case.material.poisson
+    constants[:, 0] = case.material.young
+    constants[:, 1] = case.material.poisson
     constants[:, 2] = np.where(np.isin(body, list(case.hardening)), body, -1)
     rigid = scene.rigid_elements
     constants[rigid] = constants[~rigid][0]  # moved as a whole, so no constant matters

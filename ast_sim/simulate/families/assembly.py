@@ -29,7 +29,8 @@ from ast_sim.simulate.shapes.mesh_check import BadMesh
 from ast_sim.support.errors import ConfigError, SimulationError, warn
 
 DRAWS = 10  # draws of the parameters before a sample is given up
-MESHES, NODE_TOLERANCE = 4, 0.1  # further meshes, at most, are made to come this near to a wanted number of nodes
+MESHES = 4  # further meshes, at most, are made to come near to a wanted number of nodes
+NODE_TOLERANCE = 0.1  # of the wanted number: this is near
 # Elements are longer by this power of the factor by which nodes are fewer: between the powers for surfaces and for
 # volumes. It is larger where elements are about as long as the part: its shape then sets the number of nodes.
 USUAL_POWER, LARGEST_POWER = 0.4, 2.0

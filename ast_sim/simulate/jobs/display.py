@@ -53,7 +53,9 @@ class SceneProgress(Progress):
         """A scene has `frame` of `frames` frames after `iterations` Newton iterations."""
         scene = self._inside.setdefault(name, Inside(time.monotonic()))
         scene.first = frame if scene.first is None else scene.first
-        scene.frame, scene.frames, scene.iterations = frame, frames, iterations
+        scene.frame = frame
+        scene.frames = frames
+        scene.iterations = iterations
 
     def end(self, name: str) -> None:
         """A scene is done, or has failed."""

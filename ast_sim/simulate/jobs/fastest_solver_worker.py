@@ -117,7 +117,11 @@ class VariantSolver:
         settings: SolverSettings,
         limits: dict[str, Any],
     ) -> None:
-        self.drawn, self.frames, self.truth, self.settings, self.limits = drawn, frames, truth, settings, limits
+        self.drawn = drawn
+        self.frames = frames
+        self.truth = truth
+        self.settings = settings
+        self.limits = limits
         self.frame = frames[-1]
         self.path_counts = drawn.case.friction > 0
         self.free = ~drawn.case.scene.prescribed

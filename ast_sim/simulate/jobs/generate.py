@@ -223,7 +223,8 @@ def _check_start(out: Path, made: Path, scenes: int, recipe: Recipe, module: Mod
     nodes = recipe.nodes or 1
     frames = _frames(recipe, module)
     folder = next(parent for parent in out.absolute().parents if parent.exists())
-    least, free = 16 * scenes * nodes * frames, shutil.disk_usage(folder).free
+    least = 16 * scenes * nodes * frames
+    free = shutil.disk_usage(folder).free
     if least > free:
         raise AstSimError(
             f"{counted(scenes, 'scene needs', 'scenes need')} more than {least / 1e9:,.3f} GB, but {folder} has"
@@ -234,7 +235,8 @@ def _check_start(out: Path, made: Path, scenes: int, recipe: Recipe, module: Mod
 def _grows(out: Path, settings: dict[str, Any], counts: dict[str, int]) -> bool:
     """Whether the dataset was made with these settings and has fewer scenes in a split, and more in none."""
     with Dataset(out) as dataset:
-        before, same = dataset.splits, not difference(dataset.info.generator, settings)
+        before = dataset.splits
+        same = not difference(dataset.info.generator, settings)
     return same and before != counts and all(before[split] <= counts[split] for split in SPLITS)
 
 

@@ -112,7 +112,8 @@ def outcome(spec: AssemblySpec, solved: Trajectory) -> str:
 
 def _lines(spec: AssemblySpec, case: SolidCase) -> Iterator[str]:
     """What a person should check: the nodes of each part, what stands still and what moves, the gaps."""
-    scene, unit = case.scene, spec.unit
+    scene = case.scene
+    unit = spec.unit
     travel = np.linalg.norm(case.followed()[0].prescribed_position - case.prescribed_position[0], axis=2).max(axis=0)
     for number, part in enumerate(spec.parts):
         nodes = scene.body == number

@@ -91,7 +91,8 @@ class Watch:
     """
 
     def __init__(self, manifest: Manifest, bar: SceneProgress) -> None:
-        self.manifest, self.bar = manifest, bar
+        self.manifest = manifest
+        self.bar = bar
         self.failures: dict[Sample, str] = {}
         self._since: dict[Sample, float] = {}
 

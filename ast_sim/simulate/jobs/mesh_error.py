@@ -37,7 +37,8 @@ ORDER = 1.5  # at which forces converge: 2 where parts bend, 1.5 to 1.7 where th
 MOST_SECONDS = 60.0  # processor time that half the size may take
 # Iterations on that mesh that are usual, and how much longer one takes than on the mesh of the scene: there are 5 to 8
 # times as many nodes, and the time of an iteration grows with their power 1.1 to 1.9.
-USUAL_ITERATIONS, LONGER = 30, 24.0
+USUAL_ITERATIONS = 30
+LONGER = 24.0
 MOST_STEPS = 10  # with linearised contact
 NO_FORCE = 1e-9  # a force below this, relative to Young's modulus times the square of the size, is rounding
 LEAST_COARSER = 0.9  # a mesh of twice the size has at most this share of the nodes, or it is none

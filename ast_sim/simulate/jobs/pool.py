@@ -44,7 +44,8 @@ class Process:
             start_new_session=True,  # an interrupt from the terminal reaches only the parent
         )
         assert self.process.stdin is not None and self.process.stdout is not None
-        self._stdin, self._stdout = self.process.stdin, self.process.stdout
+        self._stdin = self.process.stdin
+        self._stdout = self.process.stdout
         self._unfinished = b""  # the beginning of a line whose end has not come yet
 
     def fileno(self) -> int:
@@ -107,7 +108,9 @@ class WorkerPool:
 
     def __init__(self, samples: list[Sample], parts: Path, recipe: Recipe, watch: Watch) -> None:
         self.waiting = list(reversed(samples))
-        self.parts, self.recipe, self.watch = parts, recipe, watch
+        self.parts = parts
+        self.recipe = recipe
+        self.watch = watch
         self.active: list[Worker] = []
         self.selector = selectors.DefaultSelector()
 

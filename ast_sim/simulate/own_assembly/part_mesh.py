@@ -174,7 +174,8 @@ def _stl(request: dict[str, Any]) -> TriangleSurface:
 def _meshed(part: PartSpec, request: dict[str, Any], arrays: dict[str, np.ndarray]) -> PartMesh:
     """What gmsh has meshed."""
     groups = {key.removeprefix("group "): nodes for key, nodes in arrays.items() if key.startswith("group ")}
-    position, cells = request["scale"] * arrays["position"], arrays["elements"]
+    position = request["scale"] * arrays["position"]
+    cells = arrays["elements"]
     notes = [f"{request['name']}: {note}" for note in arrays["notes"]]
     if arrays["factor"] != 1:
         size = request["scale"] * request["size"]
@@ -250,7 +251,8 @@ def _checked(mesh: PartMesh, rigid: bool) -> PartMesh:
     Raises:
         BadMesh: it cannot be used.
     """
-    position, cells = mesh.position, mesh.cells
+    position = mesh.position
+    cells = mesh.cells
     if cells.shape[1] == 3:
         if not rigid:
             raise BadMesh(

@@ -137,7 +137,8 @@ def places_nearer(surfaces: Surfaces, distance: float, limit: float, pairs: Coll
         phase = ipctk.LBVH()
         phase.build(vertices, edges, faces, 1e-9)
         for one in phase.detect_edge_face_candidates():
-            a, b = edges[one.edge_id], faces[one.face_id]
+            a = edges[one.edge_id]
+            b = faces[one.face_id]
             apart = together[nodes[a[0]]] != together[nodes[b[0]]]
             if apart and ipctk.is_edge_intersecting_triangle(*vertices[a], *vertices[b]):
                 near.append(Near.of(surfaces, nodes[a].tolist(), nodes[b].tolist(), 0.0))

@@ -43,7 +43,9 @@ def hardening_columns(spec: AssemblySpec, values: Values) -> np.ndarray:
     for number, table in enumerate(tables):
         if len(table):
             stress, strain = table[np.minimum(np.arange(rows), len(table) - 1)].T
-            columns[number, 0], columns[number, 1::2], columns[number, 2::2] = stress[0], stress[1:], strain[1:]
+            columns[number, 0] = stress[0]
+            columns[number, 1::2] = stress[1:]
+            columns[number, 2::2] = strain[1:]
     return columns
 
 

@@ -109,7 +109,8 @@ def check_no_intersections(position: np.ndarray, triangles: np.ndarray, name: st
         return
     broad_phase.build(vertices, edges, faces, 1e-9)
     for candidate in broad_phase.detect_edge_face_candidates():
-        edge, face = edges[candidate.edge_id], faces[candidate.face_id]
+        edge = edges[candidate.edge_id]
+        face = faces[candidate.face_id]
         if not set(edge) & set(face) and ipctk.is_edge_intersecting_triangle(*vertices[edge], *vertices[face]):
             owner = int(np.argmax(np.isin(faces, edge).sum(axis=1) == 2))
             where = position[triangles[candidate.face_id]].mean(axis=0)

@@ -89,7 +89,8 @@ class GrammarParts:
         """Nothing to check: each part is checked when it is drawn."""
 
     def draw(self, rng: np.random.Generator) -> Mesher:
-        (name_a, steps_a), (name_b, steps_b) = grammar.draw_solid(rng), grammar.draw_solid(rng)
+        name_a, steps_a = grammar.draw_solid(rng)
+        name_b, steps_b = grammar.draw_solid(rng)
         requests, names = [{"solid": steps_a}, {"solid": steps_b}], [name_a, name_b]
         return lambda nodes, smallest_angle=SMALLEST_ANGLE: _checked(
             gmsh_process.mesh_parts(requests, names, nodes), smallest_angle

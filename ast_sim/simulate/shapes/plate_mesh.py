@@ -67,7 +67,9 @@ def inside(points: np.ndarray, starts: np.ndarray, ends: np.ndarray) -> np.ndarr
 
     A point is inside if an odd number of the edges, each from start to end [B,2], lie to its right.
     """
-    (x, y), (x0, y0), (x1, y1) = points.T[:, :, None], starts.T, ends.T
+    x, y = points.T[:, :, None]
+    x0, y0 = starts.T
+    x1, y1 = ends.T
     crosses = (y0 > y) != (y1 > y)
     with np.errstate(divide="ignore", invalid="ignore"):
         right = x < x0 + (y - y0) * (x1 - x0) / (y1 - y0)

@@ -25,7 +25,8 @@ KNOWN = ("program", "versions", "family", "command", "seed", "licence")
 
 def dataset_facts(dataset: Dataset, samples: Sequence[SampleFigures], seconds: SolverSeconds) -> list[list[str]]:
     """Rows of name and text: file, generator, settings and sizes. "not recorded" stands where the file is silent."""
-    info, generator = dataset.info, dataset.info.generator
+    info = dataset.info
+    generator = dataset.info.generator
     unit = info.length_unit
     element = (
         {3: "triangles", 4: "tetrahedra", 10: "second-order tetrahedra"}[dataset.element_size] if samples else "none"

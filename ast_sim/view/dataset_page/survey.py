@@ -122,7 +122,8 @@ def survey(dataset: Dataset, seconds: SolverSeconds) -> Iterator[SampleFigures]:
 
 def figures(name: str, trajectory: Trajectory, info: Any, seconds: list[float] | None) -> SampleFigures:
     """The figures of a trajectory; `info` describes its dataset."""
-    scene, attributes = trajectory.scene, trajectory.attributes
+    scene = trajectory.scene
+    attributes = trajectory.attributes
     largest = _largest_displacements(trajectory)
     stress = None
     if trajectory.stress is not None:

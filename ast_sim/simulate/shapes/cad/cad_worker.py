@@ -187,7 +187,8 @@ def _mesh_all(gmsh, models: list[PartModel], nodes: int) -> list[tuple[np.ndarra
         count = sum(len(position) for position, _ in meshes)
         off = abs(count - nodes)
         if off < nearest:
-            nearest, best = off, meshes
+            nearest = off
+            best = meshes
         if off <= NODE_TOLERANCE * nodes:
             break
         correction = count / _expected(models, size)

@@ -122,7 +122,8 @@ def _joined(corners: np.ndarray, tolerance: float) -> TriangleSurface:
     diagonal = float(np.linalg.norm(np.ptp(points, axis=0)))
     pairs = KDTree(points).query_pairs(tolerance * diagonal, output_type="ndarray")
     place = connected_parts(pairs, len(points))
-    position, triangles = points[np.unique(place, return_index=True)[1]], place[triangles]
+    position = points[np.unique(place, return_index=True)[1]]
+    triangles = place[triangles]
     points_alone = (triangles == np.roll(triangles, 1, axis=1)).any(axis=1)
     whole, needles = _without_needles(position, triangles[~points_alone])
     kept = _without_folds(whole)
