@@ -275,13 +275,12 @@ class Run:
         answers = in_domain(self.model, questions, effort, progress)
         seconds = (time.perf_counter() - began) / max(1, len(questions))
         told = []
-        for question, answer, known in zip(questions, answers, facts, strict=True):
+        for question, answer, fact in zip(questions, answers, facts, strict=True):
             p_value, unlike = (None, ()) if self.calibration is None else self.calibration.compared(answer)
             notes = (*question.notes, *unlike)
             in_doubt = notes or answer.failure is not None
             expected = None if in_doubt else self.expected_error(effort)
-            origin = {"predicted_by": str(self.path), "step": self.step, **answer.source, **known}
-            origin["source"] = answer.name
+            origin = {"predicted_by": str(self.path), "step": self.step, **answer.source, **fact, "source": answer.name}
             if in_doubt:
                 origin.pop("promise", None)
             if expected is not None:
