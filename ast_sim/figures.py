@@ -9,9 +9,9 @@ the given ones) on some `nodes` ("normal", "all"; for the stress and named field
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import Any, Self
 
 from ast_sim.named_field import REACTION
 from ast_sim.support.errors import ConfigError, nearest_name
@@ -72,6 +72,12 @@ class SceneFigures:
         row = _row(self.errors, quantity, predictor, horizon, main_nodes(quantity))
         return None if row is None else row.rmse
 
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> Self:
+        """From what `Figures.to_json` gave of a scene."""
+        errors = tuple(SceneError(*place, rmse) for place, rmse in _leaves(values["errors"]))
+        return cls(**{**values, "errors": errors})
+
 
 @dataclass(frozen=True)
 class VariantFigures:
@@ -101,6 +107,11 @@ class SolverFigures:
     cheapest_seconds: float | None
     variants: Mapping[str, VariantFigures]
 
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> Self:
+        """From what `dataclasses.asdict` gave."""
+        return cls(**{**values, "variants": {name: VariantFigures(**one) for name, one in values["variants"].items()}})
+
 
 @dataclass(frozen=True)
 class DeepestFrame:
@@ -111,7 +122,9 @@ class DeepestFrame:
         frame: its number.
         displacement: root mean square of the displacement of the free nodes in this frame.
         relative_error: the error of the displacement over the displacement; None: the prediction failed.
-        by_calls: the relative error after each call of a model that jumps, and after each Newton step.
+        after_calls: the relative error after each call of a model that jumps; empty for another.
+        after_newton_steps: the same after each Newton step; the last one again where fewer were needed. Empty where
+            none was wanted, or one failed.
         seconds: wall seconds of the answer.
         last_step: the size of the last Newton step; None without.
         stress_share: the error of the stress over the error of the frame's true mean.
@@ -124,12 +137,19 @@ class DeepestFrame:
     frame: int
     displacement: float
     relative_error: float | None
-    by_calls: tuple[float, ...]
+    after_calls: tuple[float, ...]
+    after_newton_steps: tuple[float, ...]
     seconds: float
     last_step: float | None
     stress_share: float | None
     largest_stress: float | None
     solver: SolverFigures | None = None
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> Self:
+        """From what `dataclasses.asdict` gave."""
+        solver = None if values["solver"] is None else SolverFigures.from_json(values["solver"])
+        return cls(**{**values, **_after_each(values), "solver": solver})
 
 
 @dataclass(frozen=True)
@@ -154,7 +174,8 @@ class DeepestFrames:
 
     Attributes:
         scenes: each scene.
-        relative_error, stress_share, largest_stress, by_calls: means over the scenes that did not fail.
+        relative_error, stress_share, largest_stress, after_calls, after_newton_steps: means over the scenes that did
+            not fail.
         seconds: the median of the answers' seconds.
         not_converged: the number of scenes whose Newton steps have not converged.
         solver: beside the solver at its own stop test; None: it was not run.
@@ -166,12 +187,20 @@ class DeepestFrames:
     relative_error: float | None
     stress_share: float | None
     largest_stress: float | None
-    by_calls: tuple[float, ...]
+    after_calls: tuple[float, ...]
+    after_newton_steps: tuple[float, ...]
     seconds: float | None
     not_converged: int
     solver: Beside | None
     cheapest: Beside | None
     no_solver: str | None
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> Self:
+        """From what `dataclasses.asdict` gave."""
+        scenes = tuple(DeepestFrame.from_json(scene) for scene in values["scenes"])
+        beside = {key: None if values[key] is None else Beside(**values[key]) for key in ("solver", "cheapest")}
+        return cls(**{**values, **_after_each(values), **beside, "scenes": scenes})
 
 
 @dataclass(frozen=True)
@@ -247,6 +276,14 @@ class Figures:
         scenes = [{**asdict(scene), "errors": _nested(scene.errors)} for scene in self.scenes]
         return {**asdict(self), "scenes": scenes, "errors": _nested(self.errors)}
 
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> Self:
+        """From what `to_json` gave."""
+        scenes = tuple(SceneFigures.from_json(scene) for scene in values["scenes"])
+        errors = tuple(MeanError(*place, **error) for place, error in _leaves(values["errors"]))
+        deepest = DeepestFrames.from_json(values["deepest"])
+        return cls(**{**values, "scenes": scenes, "errors": errors, "deepest": deepest})
+
 
 def _row(rows: Sequence[Any], quantity: str, predictor: str, horizon: str, nodes: str) -> Any:
     quantities = dict.fromkeys(["displacement", "stress", *(row.quantity for row in rows)])
@@ -273,3 +310,16 @@ def _nested(rows: Sequence[SceneError] | Sequence[MeanError]) -> dict[str, Any]:
         else:
             place[row.nodes] = {"rmse_sequence": row.rmse_sequence, "rmse_pooled": row.rmse_pooled}
     return table
+
+
+def _leaves(table: Mapping[str, Any]) -> Iterator[tuple[tuple[str, str, str, str], Any]]:
+    """Each error of a table that `_nested` made, with its quantity, predictor, horizon and nodes."""
+    for quantity, predictors in table.items():
+        for predictor, horizons in predictors.items():
+            for horizon, places in horizons.items():
+                for nodes, error in places.items():
+                    yield (quantity, predictor, horizon, nodes), error
+
+
+def _after_each(values: Mapping[str, Any]) -> dict[str, tuple[float, ...]]:
+    return {key: tuple(values[key]) for key in ("after_calls", "after_newton_steps")}

@@ -30,7 +30,7 @@ def _scene(name: str, error: float | None) -> SceneFigures:
     return SceneFigures(name, 400, 9, tuple(errors), None if error is None else 0.002, 0.034, failure)
 
 
-NO_DEEPEST = DeepestFrames((), None, None, None, (), None, 0, None, None, None)
+NO_DEEPEST = DeepestFrames((), None, None, None, (), (), None, 0, None, None, None)
 
 
 def evaluation(errors: dict[str, float | None], scale: float = 1.0, **changes: Any) -> Figures:

@@ -16,7 +16,7 @@ from ast_sim.mechanics.case import SolidCase
 from ast_sim.mechanics.frames import MAX_FRAME_ITERATIONS, CheckFailed, GivenUp
 from ast_sim.mechanics.linearised.linearised_contact import NewtonSteps
 from ast_sim.mechanics.physics_check import Law
-from ast_sim.mechanics.quasi_static import SolidFrames
+from ast_sim.mechanics.solid_frames import SolidFrames
 from ast_sim.mechanics.solver import SolverSettings
 from ast_sim.scene import Scene
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
 
@@ -134,7 +134,7 @@ def _by_jumps(
         if isinstance(outcome, str):
             validated.append(Validated(index, [], hold, outcome, []))
             continue
-        errors = [_motion_error(position, truth, numbers) for position in outcome.position]
+        errors = [_motion_error(position, truth, numbers) for position in outcome.after_calls]
         measured = to_measure(model.config, corrections) if efforts and index < EFFORT_SCENES else ()
         by_effort = errors_by_effort(model, truth, measured)
         validated.append(Validated(index, errors, hold, None, by_effort))
@@ -154,36 +154,40 @@ def verdict(validated: list[Validated], best: float, unit: str) -> Verdict:
         record = {"valid_rmse": None, "failure": failure}
         return Verdict(None, FIRST_CALL, [], record, f"prediction failed: {failure}")
     validated = sorted(validated, key=lambda scene: scene.index)
-    by_calls, hold = _errors_and_hold(validated)
-    network = Effort(_corrections(by_calls))
-    error = by_calls[network.corrections]
+    errors, hold = _errors_and_hold(validated)
+    network = _enough(errors)
+    error = errors[network]
     by_effort = mean_errors([scene.by_effort for scene in validated if scene.by_effort])
     effort = cheapest_good(by_effort) if by_effort else network
     share = f" = {error / hold:.2f} of the error of hold still" if hold else ""
-    after = f" after {network.text}" if len(by_calls) > 1 else ""
+    after = f" after {network.text}" if len(errors) > 1 else ""
     text = f"network alone: error {error:.3g} {unit}{share}{after}{', the best so far' if error < best else ''}"
     reached = next((one.error for one in by_effort if one.effort == effort), None)
     if reached is not None:
         text += f"; answers at the deepest frame: error {percent(reached, 3)} of the displacement after {effort.text}"
     record: dict[str, Any] = {"valid_rmse": error, "valid_hold_still": hold}
-    if len(by_calls) > 1:
-        record["valid_by_calls"] = by_calls
+    if len(errors) > 1:
+        record["valid_by_calls"] = list(errors.values())
     if by_effort:
         record["valid_by_effort"] = [asdict(one) for one in by_effort]
-    if len(by_calls) > 1 or by_effort:
+    if len(errors) > 1 or by_effort:
         record["effort"] = asdict(effort)
     return Verdict(error, effort, by_effort, record, text)
 
 
-def _errors_and_hold(validated: list[Validated]) -> tuple[list[float], float]:
-    """The error of all scenes after each call, and the one of the prediction that nothing moves."""
-    by_calls = [rmse_sequence(errors) for errors in zip(*(scene.errors for scene in validated), strict=True)]
-    return by_calls, rmse_sequence([scene.hold for scene in validated])
+def _errors_and_hold(validated: list[Validated]) -> tuple[dict[Effort, float], float]:
+    """The error of all scenes after each number of corrections, and the one of the prediction that nothing moves."""
+    after_calls = zip(*(scene.errors for scene in validated), strict=True)
+    errors = {Effort(corrections): rmse_sequence(same) for corrections, same in enumerate(after_calls)}
+    return errors, rmse_sequence([scene.hold for scene in validated])
 
 
-def _corrections(by_calls: list[float]) -> int:
-    """The number of corrections after which no further call lowers the error by more than `ENOUGH`."""
-    return next(i for i, error in enumerate(by_calls) if min(by_calls[i:]) >= (1 - ENOUGH) * error)
+def _enough(errors: Mapping[Effort, float]) -> Effort:
+    """The least effort after which no further call lowers the error by more than `ENOUGH`."""
+    rest = list(errors.items())
+    while min(error for _, error in rest) < (1 - ENOUGH) * rest[0][1]:
+        rest = rest[1:]
+    return rest[0][0]
 
 
 def _motion_error(position: np.ndarray, truth: Trajectory, frames: np.ndarray) -> SquaredError:
@@ -196,5 +200,5 @@ def error_share(validated: list[Validated]) -> float | None:
     failed or nothing moves."""
     if not validated or any(scene.failure for scene in validated):
         return None
-    by_calls, hold = _errors_and_hold(validated)
-    return min(by_calls) / hold if hold else None
+    errors, hold = _errors_and_hold(validated)
+    return min(errors.values()) / hold if hold else None

@@ -13,12 +13,13 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
 import ast_sim
 from ast_sim.dataset.solver_seconds import read_seconds
+from ast_sim.figures import DeepestFrames
 from ast_sim.inference.effort import Effort
 from ast_sim.inference.evaluation.deepest_frames import deepest_frames
 from ast_sim.inference.quantities.relative_errors import relative_error
@@ -33,7 +34,7 @@ from benchmarks.studies.phrases import (
     times_as_long,
 )
 from benchmarks.studies.rows import study_rows
-from benchmarks.studies.validation_curve import curve_line, minutes_per_step, validation_curve
+from benchmarks.studies.validation_curve import CurvePoint, curve_line, minutes_per_step, validation_curve
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "benchmarks" / "results" / "assembly.json"
@@ -69,6 +70,65 @@ class Row:
     def run_folder(self, name: str, folder: Path) -> Path:
         """Where the run of the row of that name lies."""
         return folder / f"run_{name}_{self.steps}"
+
+
+@dataclass(frozen=True)
+class WholeMotion:
+    """A test scene, all frames of which are predicted together.
+
+    Attributes:
+        frames: how many.
+        relative_error: at the deepest frame.
+        seconds: of the answer.
+        reaction, true_reaction, reaction_alone: in newton, in the last frame; the last one where that frame is
+            predicted alone.
+    """
+
+    frames: int
+    relative_error: float
+    seconds: float
+    reaction: float
+    true_reaction: float
+    reaction_alone: float
+
+
+@dataclass(frozen=True)
+class MeasuredProduct:
+    """What was measured of a row.
+
+    Attributes:
+        row: its product, scenes and training.
+        generation_minutes: of all its scenes.
+        minutes: the training steps at their median time.
+        effort: the default of the run.
+        training: its validations.
+        curves: the test scenes with all frames.
+        solver_curves: the seconds of the solver for the first of them.
+        deepest: the deepest frames of the test scenes.
+    """
+
+    row: Row
+    generation_minutes: float
+    minutes: float
+    effort: Effort
+    training: list[CurvePoint]
+    curves: list[WholeMotion]
+    solver_curves: list[float]
+    deepest: DeepestFrames
+
+    @classmethod
+    def from_json(cls, values: dict[str, Any]) -> Self:
+        """From what `measured` gave."""
+        return cls(
+            Row(**{**values["row"], "spec": Path(values["row"]["spec"])}),
+            values["generation_minutes"],
+            values["minutes"],
+            Effort(**values["effort"]),
+            [CurvePoint(**point) for point in values["training"]],
+            [WholeMotion(**curve) for curve in values["curves"]],
+            values["solver_curves"],
+            DeepestFrames.from_json(values["deepest"]),
+        )
 
 
 _SETTINGS = {"peak_rate": 2e-3, "validate_scenes": 10, "validate_every": 500, "checkpoint_every": 500}
@@ -133,35 +193,34 @@ def measured(name: str, folder: Path) -> dict[str, Any]:
         deepest = deepest_frames(run.model, dataset, "test", run.effort, row.solver_scenes, made_from=row.spec)
         curves = [_curve(run, dataset, index) for index in range(row.test)]
         solver_seconds = read_seconds(dataset).samples.values()
-    return {
-        **provenance(f"python -m benchmarks.studies.assembly {name}"),
-        "row": {**asdict(row), "spec": f"{row.spec.parent.name}/{row.spec.name}"},
-        "generation_minutes": float(sum(map(sum, solver_seconds))) / 60,
-        "minutes": minutes_per_step(run) * row.steps,
-        "effort": asdict(run.effort),
-        "training": validation_curve(run),
-        "curves": curves,
-        "solver_curves": _solver_curves(row) if row.solver_scenes else [],
-        **asdict(deepest),
-    }
+    record = MeasuredProduct(
+        row,
+        generation_minutes=float(sum(map(sum, solver_seconds))) / 60,
+        minutes=minutes_per_step(run) * row.steps,
+        effort=run.effort,
+        training=validation_curve(run),
+        curves=curves,
+        solver_curves=_solver_curves(row) if row.solver_scenes else [],
+        deepest=deepest,
+    )
+    spec = {"row": {**asdict(row), "spec": f"{row.spec.parent.name}/{row.spec.name}"}}
+    return {**provenance(f"python -m benchmarks.studies.assembly {name}"), **asdict(record), **spec}
 
 
-def _curve(run: ast_sim.Run, dataset: ast_sim.Dataset, index: int) -> dict[str, float]:
-    """A test scene, all frames of which are predicted together: the relative error at the deepest frame, the seconds;
-    the reaction in newton in the last frame, the true one, and the one of the last frame alone."""
+def _curve(run: ast_sim.Run, dataset: ast_sim.Dataset, index: int) -> WholeMotion:
     truth = dataset.load("test", index)
     began = time.perf_counter()
     answer = run.predict(truth)
     seconds = time.perf_counter() - began
     deepest = deepest_frame(truth)
-    return {
-        "frames": int(answer.computed.sum()),
-        "relative_error": relative_error(answer.position[deepest], truth, deepest),
-        "seconds": seconds,
-        "reaction": _last_reaction(run, answer),
-        "true_reaction": truth.attributes["reaction"][-1],
-        "reaction_alone": _last_reaction(run, run.predict(truth, frames=[-1])),
-    }
+    return WholeMotion(
+        frames=int(answer.computed.sum()),
+        relative_error=relative_error(answer.position[deepest], truth, deepest),
+        seconds=seconds,
+        reaction=_last_reaction(run, answer),
+        true_reaction=truth.attributes["reaction"][-1],
+        reaction_alone=_last_reaction(run, run.predict(truth, frames=[-1])),
+    )
 
 
 def _last_reaction(run: ast_sim.Run, answer: ast_sim.Answer) -> float:
@@ -182,36 +241,25 @@ def _solver_curves(row: Row) -> list[float]:
 
 def page(results: dict[str, Any]) -> str:
     """The page of all rows that have a result."""
-    shown = [results[name] for name in ROWS if name in results]
-    alone = [
-        "product",
-        "trained",
-        "minutes",
-        "one call",
-        "error",
-        "reaction",
-        "largest stress",
-        "answer",
-        "solver",
-        "fastest setting",
-        "pays after",
-    ]
+    shown = [MeasuredProduct.from_json(results[name]) for name in ROWS if name in results]
+    alone = "product, trained, minutes, one call, error, reaction, largest stress, answer, solver, fastest setting"
     together = ["product", "frames", "error", "reaction", "answer", "solver"]
-    introduction = _INTRODUCTION.format(settings=settings_tried(shown))
-    lines = [introduction, *table_head(alone, texts=2), *map(_alone, shown)]
+    introduction = _INTRODUCTION.format(settings=settings_tried({one.row.title: one.deepest for one in shown}))
+    lines = [introduction, *table_head([*alone.split(", "), "pays after"], texts=2), *map(_alone, shown)]
     lines += [_TOGETHER, *table_head(together, texts=1), *map(_together, shown)]
-    return "\n".join([*lines, *(line for record in shown for line in _section(record))])
+    return "\n".join([*lines, *(line for one in shown for line in _section(one))])
 
 
-def _section(record: dict[str, Any]) -> list[str]:
+def _section(one: MeasuredProduct) -> list[str]:
     """The worst scenes of a row, and how its errors fell."""
+    deepest = one.deepest
     return [
         "",
-        f"## {record['row']['title']}",
+        f"## {one.row.title}",
         "",
-        f"{Effort(**record['effort']).text}. {over_the_scenes(record['scenes'])} The Newton steps have not converged in"
-        f" {record['not_converged']} of {len(record['scenes'])} scenes.",
-        *([curve_line(record["training"])] if record["training"] else []),
+        f"{one.effort.text}. {over_the_scenes(deepest.scenes)} The Newton steps have not converged in"
+        f" {deepest.not_converged} of {len(deepest.scenes)} scenes.",
+        *([curve_line(one.training)] if one.training else []),
     ]
 
 
@@ -240,37 +288,36 @@ other.
 """
 
 
-def _alone(record: dict[str, Any]) -> str:
-    row, solver = record["row"], record["solver"]
-    errors = [scene["relative_error"] for scene in record["scenes"] if scene["relative_error"] is not None]
-    spent = 60 * (record["generation_minutes"] + record["minutes"])
-    seconds = [scene["seconds"] for scene in record["scenes"]]
-    saved = 0.0 if solver is None else solver["seconds"] - solver["model_seconds"]
+def _alone(one: MeasuredProduct) -> str:
+    row, deepest = one.row, one.deepest
+    errors = [scene.relative_error for scene in deepest.scenes]
+    seconds = [scene.seconds for scene in deepest.scenes]
+    spent = 60 * (one.generation_minutes + one.minutes)
+    saved = 0.0 if deepest.solver is None else deepest.solver.seconds - deepest.solver.model_seconds
     return table_line([
-        row["title"],
-        f"{row['train']} scenes ({record['generation_minutes']:.1f} min), {row['steps']:,} steps",
-        f"{record['minutes']:.0f}",
-        _percent([scene["by_calls"][0] for scene in record["scenes"] if scene["by_calls"]]),
-        _percent(errors),
-        _reaction(record, "reaction_alone"),
-        "-" if record["largest_stress"] is None else f"{100 * record['largest_stress']:.0f} %",
-        f"{1000 * record['seconds']:.0f} ms",
-        beside_solver(record["scenes"], [0.0] * len(record["scenes"]), seconds),
-        beside_solver(record["scenes"], [scene["relative_error"] for scene in record["scenes"]], seconds),
-        f"{spent / saved:,.0f} questions" if saved > 0 else "never: the solver is faster" if solver else "-",
+        row.title,
+        f"{row.train} scenes ({one.generation_minutes:.1f} min), {row.steps:,} steps",
+        f"{one.minutes:.0f}",
+        _percent([scene.after_calls[0] for scene in deepest.scenes if scene.after_calls]),
+        _percent([error for error in errors if error is not None]),
+        _reaction(one, alone=True),
+        "-" if deepest.largest_stress is None else f"{100 * deepest.largest_stress:.0f} %",
+        f"{1000 * deepest.seconds:.0f} ms",
+        beside_solver(deepest.scenes, [0.0] * len(errors), seconds),
+        beside_solver(deepest.scenes, errors, seconds),
+        f"{spent / saved:,.0f} questions" if saved > 0 else "never: the solver is faster" if deepest.solver else "-",
     ])  # fmt: skip
 
 
-def _together(record: dict[str, Any]) -> str:
-    curves, solver = record["curves"], record["solver_curves"]
-    ratios = [theirs / ours["seconds"] for theirs, ours in zip(solver, curves, strict=False)]
+def _together(one: MeasuredProduct) -> str:
+    ratios = [theirs / ours.seconds for theirs, ours in zip(one.solver_curves, one.curves, strict=False)]
     return table_line([
-        record["row"]["title"],
-        str(curves[0]["frames"]),
-        _percent([curve["relative_error"] for curve in curves]),
-        _reaction(record, "reaction"),
-        f"{1000 * np.median([curve['seconds'] for curve in curves]):.0f} ms",
-        times_as_long(solver, ratios) if solver else "-",
+        one.row.title,
+        str(one.curves[0].frames),
+        _percent([motion.relative_error for motion in one.curves]),
+        _reaction(one, alone=False),
+        f"{1000 * np.median([motion.seconds for motion in one.curves]):.0f} ms",
+        times_as_long(one.solver_curves, ratios) if one.solver_curves else "-",
     ])  # fmt: skip
 
 
@@ -278,8 +325,11 @@ def _percent(errors: Sequence[float]) -> str:
     return f"{100 * np.mean(errors):.2g} ± {100 * np.std(errors) / len(errors) ** 0.5:.1g} %"
 
 
-def _reaction(record: dict[str, Any], key: str) -> str:
-    errors = [abs(c[key] / c["true_reaction"] - 1) for c in record["curves"] if c["true_reaction"] > 0]
+def _reaction(one: MeasuredProduct, alone: bool) -> str:
+    """The errors of the force in the last frame, which is predicted alone or with all others."""
+    touching = [motion for motion in one.curves if motion.true_reaction > 0]
+    shares = [(motion.reaction_alone if alone else motion.reaction) / motion.true_reaction for motion in touching]
+    errors = [abs(share - 1) for share in shares]
     return f"{100 * np.mean(errors):.2g} %, median {100 * np.median(errors):.2g} %"
 
 
@@ -288,7 +338,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _said(record: dict[str, Any]) -> str:
-    return f"{100 * record['relative_error']:.3g} %, reaction {_reaction(record, 'reaction')}"
+    one = MeasuredProduct.from_json(record)
+    return f"{100 * one.deepest.relative_error:.3g} %, reaction {_reaction(one, alone=False)}"
 
 
 if __name__ == "__main__":

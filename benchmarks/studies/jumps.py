@@ -10,18 +10,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
 import ast_sim
+from ast_sim.figures import DeepestFrames
 from ast_sim.inference.effort import MOST_NEWTON_STEPS, Effort, can_make_newton_steps
 from ast_sim.inference.evaluation.deepest_frames import deepest_frames
 from ast_sim.mechanics.linearised.linearised_contact import STILL
 from ast_sim.support.provenance import provenance
 from benchmarks.studies.phrases import beside_solver, over_the_scenes, settings_tried
 from benchmarks.studies.rows import study_rows
-from benchmarks.studies.validation_curve import curve_line, minutes_per_step, validation_curve
+from benchmarks.studies.validation_curve import CurvePoint, curve_line, minutes_per_step, validation_curve
 
 RESULTS = Path(__file__).parents[1] / "results" / "jumps.json"
 PAGE = Path(__file__).parents[2] / "docs" / "results" / "jumps.md"
@@ -61,6 +62,59 @@ class Row:
     model_settings: dict[str, Any] = field(default_factory=dict)
     settings: dict[str, Any] = field(default_factory=dict)
     solver_scenes: int = 0
+
+
+@dataclass(frozen=True)
+class Turned:
+    """The answers of one setting of the dial to all test scenes.
+
+    Attributes:
+        effort: the setting.
+        relative_error, seconds: of each scene.
+        stress_share, largest_stress: means over the scenes.
+    """
+
+    effort: Effort
+    relative_error: list[float | None]
+    seconds: list[float]
+    stress_share: float | None
+    largest_stress: float | None
+
+
+@dataclass(frozen=True)
+class MeasuredRow:
+    """What was measured of a row.
+
+    Attributes:
+        row: its scenes and training.
+        minutes: the training steps at their median time.
+        effort: the default of the run.
+        curve: its validations.
+        dial: the settings, from fastest to most accurate; empty for a model that goes step by step.
+        training_scenes: the error in scenes of the training.
+        deepest: the test scenes, with the default effort.
+    """
+
+    row: Row
+    minutes: float
+    effort: Effort
+    curve: list[CurvePoint]
+    dial: list[Turned]
+    training_scenes: float
+    deepest: DeepestFrames
+
+    @classmethod
+    def from_json(cls, values: dict[str, Any]) -> Self:
+        """From what `measured` gave."""
+        return cls(
+            Row(**values["row"]),
+            values["minutes"],
+            Effort(**values["effort"]),
+            [CurvePoint(**point) for point in values["curve"]],
+            [Turned(**{**turned, "effort": Effort(**turned["effort"])}) for turned in values["dial"]],
+            values["training_scenes"],
+            DeepestFrames.from_json(values["deepest"]),
+        )
 
 
 _PLATES = {"family": "deforming_plate", "frames": 41}
@@ -146,16 +200,9 @@ def measured(name: str, folder: Path) -> dict[str, Any]:
         deepest = deepest_frames(run.model, dataset, "test", run.effort, row.solver_scenes)
         known = deepest_frames(run.model, dataset, "train", run.effort, most_scenes=TRAINING_SCENES).relative_error
         dial = [_turned(run, dataset, effort) for effort in _efforts(run)]
-    return {
-        **provenance(f"python -m benchmarks.studies.jumps {name}"),
-        "row": asdict(row),
-        "minutes": minutes_per_step(run) * row.steps,
-        "effort": asdict(run.effort),
-        "curve": validation_curve(run),
-        "dial": dial,
-        "training_scenes": known,
-        **asdict(deepest),
-    }
+    minutes = minutes_per_step(run) * row.steps
+    record = MeasuredRow(row, minutes, run.effort, validation_curve(run), dial, known, deepest)
+    return {**provenance(f"python -m benchmarks.studies.jumps {name}"), **asdict(record)}
 
 
 def _efforts(run: ast_sim.Run) -> list[Effort]:
@@ -167,23 +214,18 @@ def _efforts(run: ast_sim.Run) -> list[Effort]:
     return calls + ([Effort(*pair) for pair in WITH_NEWTON] if can_make_newton_steps(config) else [])
 
 
-def _turned(run: ast_sim.Run, dataset: ast_sim.Dataset, effort: Effort) -> dict[str, Any]:
-    """The answers of one setting of the dial to all test scenes."""
-    deepest = deepest_frames(run.model, dataset, "test", effort)
-    return {
-        **asdict(effort),
-        "relative_error": [scene.relative_error for scene in deepest.scenes],
-        "seconds": [scene.seconds for scene in deepest.scenes],
-        "stress_share": deepest.stress_share,
-        "largest_stress": deepest.largest_stress,
-    }
+def _turned(run: ast_sim.Run, dataset: ast_sim.Dataset, effort: Effort) -> Turned:
+    frames = deepest_frames(run.model, dataset, "test", effort)
+    errors = [scene.relative_error for scene in frames.scenes]
+    seconds = [scene.seconds for scene in frames.scenes]
+    return Turned(effort, errors, seconds, frames.stress_share, frames.largest_stress)
 
 
 def page(results: dict[str, Any]) -> str:
     """The page of all rows that have a result."""
-    shown = {name: results[name] for name in ROWS if name in results}
-    introduction = _INTRODUCTION.format(settings=settings_tried(shown.values()))
-    return "\n".join([introduction, *_table(shown), *(line for record in shown.values() for line in _section(record))])
+    shown = [MeasuredRow.from_json(results[name]) for name in ROWS if name in results]
+    introduction = _INTRODUCTION.format(settings=settings_tried({one.row.title: one.deepest for one in shown}))
+    return "\n".join([introduction, *_table(shown), *(line for one in shown for line in _section(one))])
 
 
 _INTRODUCTION = """# Any frame in one jump
@@ -212,30 +254,31 @@ the scenes in which the solver was run (ten; five pairs of parts), with its stan
 """
 
 
-def _table(shown: dict[str, Any]) -> list[str]:
+def _table(shown: Sequence[MeasuredRow]) -> list[str]:
     head = ["scenes", "trained", "minutes", "effort", "error", "training scenes", "answer", "solver", "cheapest"]
     lines = ["| " + " | ".join(head) + " |", "| --- | --- | ---: | --- |" + " ---: |" * (len(head) - 4)]
-    for record in shown.values():
-        row, errors = record["row"], [scene["relative_error"] for scene in record["scenes"]]
-        seconds = [scene["seconds"] for scene in record["scenes"]]
+    for one in shown:
+        scenes = one.deepest.scenes
+        errors = [scene.relative_error for scene in scenes]
+        seconds = [scene.seconds for scene in scenes]
         lines.append("| " + " | ".join([
-            row["title"],
-            _trained_text(row),
-            f"{record['minutes']:.0f}",
-            Effort(**record["effort"]).text if row["model_settings"].get("jumps", True) else "every frame",
+            one.row.title,
+            _trained_text(one.row),
+            f"{one.minutes:.0f}",
+            one.effort.text if one.row.model_settings.get("jumps", True) else "every frame",
             _percent(errors),
-            f"{100 * record['training_scenes']:.1f} %",
+            f"{100 * one.training_scenes:.1f} %",
             f"{1000 * np.median(seconds):.0f} ms",
-            beside_solver(record["scenes"], [0.0] * len(errors), seconds),
-            beside_solver(record["scenes"], errors, seconds),
+            beside_solver(scenes, [0.0] * len(errors), seconds),
+            beside_solver(scenes, errors, seconds),
         ]) + " |")  # fmt: skip
     return lines
 
 
-def _trained_text(row: dict[str, Any]) -> str:
-    corrections = row["settings"].get("corrections", 0)
+def _trained_text(row: Row) -> str:
+    corrections = row.settings.get("corrections", 0)
     together = f", {corrections + 1} calls trained together" if corrections else ""
-    return f"{row['train']:,} scenes, {row['steps']:,} steps{together}"
+    return f"{row.train:,} scenes, {row.steps:,} steps{together}"
 
 
 def _percent(errors: list[float | None]) -> str:
@@ -244,30 +287,31 @@ def _percent(errors: list[float | None]) -> str:
     return f"{np.mean(known):.1f} ± {np.std(known) / len(known) ** 0.5:.1f} %{failed}"
 
 
-def _section(record: dict[str, Any]) -> list[str]:
-    lines = ["", f"## {record['row']['title']}", "", over_the_scenes(record["scenes"])]
-    not_converged = [scene["name"] for scene in record["scenes"] if (scene["last_step"] or 0) > STILL]
+def _section(one: MeasuredRow) -> list[str]:
+    deepest = one.deepest
+    lines = ["", f"## {one.row.title}", "", over_the_scenes(deepest.scenes)]
+    not_converged = [scene.name for scene in deepest.scenes if (scene.last_step or 0) > STILL]
     if not_converged:
-        share = f"{len(not_converged)} of {len(record['scenes'])} scenes"
+        share = f"{len(not_converged)} of {len(deepest.scenes)} scenes"
         lines.append(f"The Newton steps have not converged in {share}: {', '.join(not_converged)}.")
-    if record["stress_share"] is not None:
+    if deepest.stress_share is not None and deepest.largest_stress is not None:
         lines.append(
-            f"Stress: the error is {record['stress_share']:.2f} times the standard deviation of the true stress; the"
-            f" largest stress is {100 * record['largest_stress']:.0f} % off."
+            f"Stress: the error is {deepest.stress_share:.2f} times the standard deviation of the true stress; the"
+            f" largest stress is {100 * deepest.largest_stress:.0f} % off."
         )
-    if record.get("curve"):
-        lines.append(curve_line(record["curve"]))
-    if record["dial"]:
+    if one.curve:
+        lines.append(curve_line(one.curve))
+    if one.dial:
         head = ["corrections", "Newton steps", "error", "stress", "answer", "cheapest"]
         lines += ["", "| " + " | ".join(head) + " |", "|" + " ---: |" * len(head)]
-    for turned in record["dial"]:
+    for turned in one.dial:
         lines.append("| " + " | ".join([
-            f"{turned['corrections']}",
-            f"up to {turned['newton_steps']}" if turned["newton_steps"] else "0",
-            _percent(turned["relative_error"]),
-            "-" if turned["stress_share"] is None else f"{turned['stress_share']:.2f}",
-            f"{1000 * np.median(turned['seconds']):.0f} ms",
-            beside_solver(record["scenes"], turned["relative_error"], turned["seconds"]),
+            f"{turned.effort.corrections}",
+            f"up to {turned.effort.newton_steps}" if turned.effort.newton_steps else "0",
+            _percent(turned.relative_error),
+            "-" if turned.stress_share is None else f"{turned.stress_share:.2f}",
+            f"{1000 * np.median(turned.seconds):.0f} ms",
+            beside_solver(deepest.scenes, turned.relative_error, turned.seconds),
         ]) + " |")  # fmt: skip
     return lines
 
@@ -277,7 +321,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _said(record: dict[str, Any]) -> str:
-    return f"{100 * record['relative_error']:.3g} %"
+    return f"{100 * MeasuredRow.from_json(record).deepest.relative_error:.3g} %"
 
 
 if __name__ == "__main__":

@@ -18,7 +18,6 @@ import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -31,6 +30,7 @@ from ast_sim.inference.predicting.question import Question
 from ast_sim.inference.trained_run import Run
 from ast_sim.scene import NodeType, Trajectory
 from ast_sim.support.disk import write_json
+from benchmarks.studies.measured_run import MeasuredRun, PhaseError
 
 FIRST = 3  # frames that count as the beginning of contact
 PHASES = ("before", "first", "full", "release")
@@ -79,12 +79,10 @@ def long_rollouts(run: Run, dataset: Dataset, horizons: int) -> Iterator[tuple[T
         yield truth, answers(run.model, [question], run.effort)[0]
 
 
-def measure(run: Run, horizons: int, command: str) -> dict[str, Any]:
-    """The evaluation of a run with `phases` (for each, `rmse_sequence` and `rmse_pooled`), `diverged` (what stopped a
-    long rollout, by scene) and `farthest` (the largest distance in all of them from the centre of the domain over the
-    largest in the truth)."""
-    figures = run.evaluate(command=command).figures.to_json()
-    del figures["origin"]["data"]  # a path of this machine
+def measure(run: Run, horizons: int, command: str) -> MeasuredRun:
+    """The evaluation of a run, its errors by phase, and its long rollouts."""
+    figures = run.evaluate(command=command).figures
+    here = {key: value for key, value in figures.origin.items() if key != "data"}  # that is a path of this machine
     errors: dict[str, list[SquaredError]] = {name: [] for name in PHASES}
     diverged, farthest, center = {}, 0.0, np.array(run.info.domain_center)
     with run.open() as dataset:
@@ -95,25 +93,25 @@ def measure(run: Run, horizons: int, command: str) -> dict[str, Any]:
                 diverged[result.name] = result.failure
             reach = [float(np.abs(p - center).max()) for p in (result.position, truth.position)]
             farthest = max(farthest, reach[0] / reach[1])
-    return {
-        **figures,
-        "parameters": run.model.num_parameters,
-        "phases": {
-            name: {"rmse_sequence": rmse_sequence(list_), "rmse_pooled": rmse_pooled(list_)}
+    return MeasuredRun(
+        figures=replace(figures, origin=here),
+        parameters=run.model.num_parameters,
+        phases={
+            name: PhaseError(rmse_sequence(list_), rmse_pooled(list_))
             for name, list_ in errors.items()
             if any(error.count for error in list_)
         },
-        "horizons": horizons,
-        "diverged": diverged,
-        "farthest": farthest,
-    }
+        horizons=horizons,
+        diverged=diverged,
+        farthest=farthest,
+    )
 
 
 def main() -> None:
     run_folder, horizons, file = sys.argv[1:]
     keep_memory()
     command = f"python -m benchmarks.studies.measure {run_folder} {horizons} {file}"
-    write_json(Path(file), measure(Run(run_folder), int(horizons), command))
+    write_json(Path(file), measure(Run(run_folder), int(horizons), command).to_json())
 
 
 if __name__ == "__main__":

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import json
-import math
 import statistics
 from collections import Counter
 from collections.abc import Callable
@@ -14,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.steps import scaling_page
+from benchmarks.studies.measured_run import MeasuredRun
 from benchmarks.svg import axes_of_picture, save
 
 INTRODUCTION = """# The models compared
@@ -35,14 +35,12 @@ AIM = 0.5  # AST's rollout error over the best baseline's; the paper reports 0.3
 BASELINES = ("mgn", "bsms", "hcmt")  # of the paper
 
 Run = dict[str, Any]
+Value = Callable[[Run], Any]
 
 
 def write_page(results: Path, pages: Path) -> None:
     """Write study.md and its pictures into `pages`, from the files study_*.json in `results`."""
-    studies = {
-        file.stem.removeprefix("study_"): json.loads(file.read_text(encoding="utf-8"))
-        for file in sorted(results.glob("study_*.json"))
-    }
+    studies = {file.stem.removeprefix("study_"): read(file) for file in sorted(results.glob("study_*.json"))}
     parts = [INTRODUCTION, *glance({record["study"]["title"]: record["models"] for record in studies.values()})]
     for name, record in studies.items():
         draw(record, pages / "study" / f"{name}.svg")
@@ -52,6 +50,14 @@ def write_page(results: Path, pages: Path) -> None:
         scaling_page.draw(record, pages / "study" / "scaling.svg")
         parts.append(scaling_page.section(record))
     (pages / "study.md").write_text("\n".join(parts), encoding="utf-8")
+
+
+def read(file: Path) -> dict[str, Any]:
+    """A result file of a study, in which a run that was measured has a MeasuredRun."""
+    study = json.loads(file.read_text(encoding="utf-8"))
+    for run in (run for model in study["models"].values() for run in model["runs"] if "measured" in run):
+        run["measured"] = MeasuredRun.from_json(run["measured"])
+    return study
 
 
 def section(record: dict[str, Any], name: str) -> str:
@@ -65,7 +71,7 @@ def section(record: dict[str, Any], name: str) -> str:
         "",
     ]
     lines += [*verdict(models), *table(models, ERRORS), "", *trivial(models), ""]
-    if any(measured(run).get("phases") for model in models.values() for run in model["runs"]):
+    if any(one.phases for one in measured_runs(models)):
         lines += ["Error by phase of contact, full rollout, mm (`rmse_sequence`):", "", *table(models, BY_PHASE), ""]
     lines += [
         *table(models, COST),
@@ -97,7 +103,7 @@ def seeds(models: dict[str, Any]) -> str:
 
 def origins(models: dict[str, Any]) -> list[str]:
     """The commits and processors of the runs, each once."""
-    made = [measured(run)["origin"] for model in models.values() for run in model["runs"] if measured(run)]
+    made = [one.figures.origin for one in measured_runs(models)]
     commits = sorted({(record["commit"] or "?")[:10] for record in made})
     return [
         f"commit{'s' if len(commits) > 1 else ''} {', '.join(commits)}",
@@ -105,54 +111,48 @@ def origins(models: dict[str, Any]) -> list[str]:
     ]
 
 
-def measured(run: Run) -> dict[str, Any]:
-    """What was found of a run on the test scenes; nothing if it failed."""
-    return run.get("measured", {})
+def measured(run: Run) -> MeasuredRun | None:
+    """None: the run failed."""
+    return run.get("measured")
 
 
-def _error(predictor: str, quantity: str, horizon: str, nodes: str, key: str, scale: float) -> Callable[[Run], Any]:
-    def value(run: Run) -> float | None:
-        errors = measured(run).get("errors", {}).get(quantity, {}).get(predictor, {}).get(horizon)
-        error = None if errors is None else errors[nodes][key]
-        return None if error is None else scale * error
-
-    return value
+def measured_runs(models: dict[str, Any]) -> list[MeasuredRun]:
+    """The runs of all rows that did not fail."""
+    return [one for model in models.values() for run in model["runs"] if (one := measured(run)) is not None]
 
 
-def _displacement(horizon: str, key: str = "rmse_sequence", predictor: str = "model") -> Callable[[Run], Any]:
-    return _error(predictor, "displacement", horizon, "normal", key, 1e3)
+def _of(value: Callable[[MeasuredRun], float | None], scale: float = 1) -> Value:
+    """A figure of what was measured; None where the run failed."""
+
+    def scaled(run: Run) -> float | None:
+        one = measured(run)
+        figure = None if one is None else value(one)
+        return None if figure is None else scale * figure
+
+    return scaled
 
 
-def _phase(name: str) -> Callable[[Run], Any]:
-    def value(run: Run) -> float | None:
-        phase = measured(run).get("phases", {}).get(name)
-        return None if phase is None else 1e3 * phase["rmse_sequence"]
-
-    return value
+def _error(quantity: str, horizon: str, scale: float, predictor: str = "model") -> Value:
+    return _of(lambda one: one.error(quantity, predictor, horizon).rmse_sequence, scale)
 
 
-def _of_samples(run: Run, key: str) -> float | None:
-    values = [scene[key] for scene in measured(run).get("scenes", [])]
-    return None if not values or None in values else 1e3 * statistics.fmean(values)
-
-
-Columns = dict[str, Callable[[Run], Any]]
+Columns = dict[str, Value]
 ERRORS: Columns = {
-    "1 step, mm": _displacement("one_step"),
-    "50 steps, mm": _displacement("rollout_50"),
-    "rollout, mm": _displacement("rollout_all"),
-    "pooled, mm": _displacement("rollout_all", "rmse_pooled"),
-    "stress, 1 step, kPa": _error("model", "stress", "one_step", "deforming", "rmse_sequence", 1e-3),
-    "stress, rollout, kPa": _error("model", "stress", "rollout_all", "deforming", "rmse_sequence", 1e-3),
+    "1 step, mm": _error("displacement", "one_step", 1e3),
+    "50 steps, mm": _error("displacement", "rollout_50", 1e3),
+    "rollout, mm": _error("displacement", "rollout_all", 1e3),
+    "pooled, mm": _of(lambda one: one.error("displacement").rmse_pooled, 1e3),
+    "stress, 1 step, kPa": _error("stress", "one_step", 1e-3),
+    "stress, rollout, kPa": _error("stress", "rollout_all", 1e-3),
 }
 BY_PHASE: Columns = {
-    "before contact": _phase("before"),
-    "first contact": _phase("first"),
-    "full contact": _phase("full"),
-    "release": _phase("release"),
+    "before contact": _of(lambda one: one.phase_error("before"), 1e3),
+    "first contact": _of(lambda one: one.phase_error("first"), 1e3),
+    "full contact": _of(lambda one: one.phase_error("full"), 1e3),
+    "release": _of(lambda one: one.phase_error("release"), 1e3),
 }
 COST: Columns = {
-    "parameters": lambda run: measured(run).get("parameters"),
+    "parameters": _of(lambda one: one.parameters),
     "learning rate": lambda run: run["rate"],
     "noise, mm": lambda run: None if run.get("noise") is None else 1e3 * run["noise"],
     "batch": lambda run: run["batch"],
@@ -161,7 +161,7 @@ COST: Columns = {
     "steps": lambda run: run["steps"],
     "trained, min": lambda run: run["train_seconds"] / 60,
     "peak memory, GB": lambda run: run["peak_resident_bytes"] / 1e9,
-    "ms a rollout step": lambda run: _of_samples(run, "model_seconds_per_step"),
+    "ms a rollout step": _of(MeasuredRun.seconds_per_step, 1e3),
 }
 
 
@@ -234,7 +234,7 @@ def own_settings(study: dict[str, Any], models: dict[str, Any]) -> list[str]:
     return [f"Set beyond the presets. {'; '.join(told)}.", ""] if told else []
 
 
-def _mean(runs: list[Run], value: Callable[[Run], Any]) -> float | None:
+def _mean(runs: list[Run], value: Value) -> float | None:
     """The mean over the seeds; None if a run has no such figure."""
     values = [value(run) for run in runs]
     return None if None in values else statistics.fmean(values)
@@ -272,7 +272,7 @@ def table(models: dict[str, Any], columns: Columns) -> list[str]:
     return lines + [f"| {name} | {' | '.join(row[column] or '-' for column in shown)} |" for name, row in cells.items()]
 
 
-def of_seeds(runs: list[Run], value: Callable[[Run], Any]) -> str:
+def of_seeds(runs: list[Run], value: Value) -> str:
     """Mean, and the least and the most in brackets where runs differ; "failed" if a run that has results has none."""
     values = [value(run) for run in runs]
     if all(x is None for x in values):
@@ -291,15 +291,15 @@ def number(x: float) -> str:
 
 def trivial(models: dict[str, Any]) -> list[str]:
     """What predictors without a model reach on the same scenes."""
-    runs = [run for model in models.values() for run in model["runs"] if measured(run)]
+    runs = [run for model in models.values() for run in model["runs"] if measured(run) is not None]
     if not runs:
         return []
     texts = [
         f"{what} {number(error)} mm"
         for what, error in (
-            ("one step: hold still", _displacement("one_step", predictor="hold_still")(runs[0])),
-            ("repeat the last increment", _displacement("one_step", predictor="repeat_last")(runs[0])),
-            ("rollout: hold still", _displacement("rollout_all", predictor="hold_still")(runs[0])),
+            ("one step: hold still", _error("displacement", "one_step", 1e3, "hold_still")(runs[0])),
+            ("repeat the last increment", _error("displacement", "one_step", 1e3, "repeat_last")(runs[0])),
+            ("rollout: hold still", _error("displacement", "rollout_all", 1e3, "hold_still")(runs[0])),
         )
         if error is not None
     ]
@@ -313,11 +313,11 @@ def divergences(models: dict[str, Any], horizons: int) -> list[str]:
         for run in model["runs"]:
             if "failed" in run:
                 lines.append(f"- {name}, seed {run['seed']}: not evaluated: {run['failed']}")
-            lines += [f"- {name}, seed {run['seed']}: {text}" for text in measured(run).get("diverged", {}).values()]
-    farthest = {
-        name: max(measured(run).get("farthest", math.nan) for run in model["runs"]) for name, model in models.items()
-    }
-    reach = ", ".join(f"{name} {value:.2g}" for name, value in farthest.items() if not math.isnan(value))
+            one = measured(run)
+            diverged = {} if one is None else one.diverged
+            lines += [f"- {name}, seed {run['seed']}: {text}" for text in diverged.values()]
+    farthest = {name: [one.farthest for one in measured_runs({name: model})] for name, model in models.items()}
+    reach = ", ".join(f"{name} {max(values):.2g}" for name, values in farthest.items() if values)
     first = f"Rolled out for {horizons} times the length of the scenes"
     told = (
         f"{first}, these did not stay finite:" if lines else f"{first}, every model stays finite on every test scene."

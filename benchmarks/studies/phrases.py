@@ -2,37 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from ast_sim.figures import DeepestFrame, DeepestFrames
 from ast_sim.simulate.jobs.fastest_solver import VARIANTS
 
 SHOWN_WORST = 5
 RESAMPLES = 2000
 
 
-def beside_solver(scenes: Sequence[dict[str, Any]], errors: Sequence[float | None], seconds: Sequence[float]) -> str:
+def beside_solver(scenes: Sequence[DeepestFrame], errors: Sequence[float | None], seconds: Sequence[float]) -> str:
     """The solver's time and its ratio to the answers', where the solver was run and the answer did not fail. In each
     scene the fastest setting counts that is as accurate as the answer; the own stop test always is."""
     taken, ratios = [], []
     for scene, error, answer in zip(scenes, errors, seconds, strict=True):
-        solver = scene["solver"]
-        if solver is None or solver["seconds"] is None or error is None:
+        solver = scene.solver
+        if solver is None or solver.seconds is None or error is None:
             continue
-        solved = [figures for figures in solver["variants"].values() if figures["failure"] is None]
-        fit = [figures["seconds"] for figures in solved if figures["relative_error"] <= error]
-        taken.append(min([*fit, solver["seconds"]]))
+        solved = [one for one in solver.variants.values() if one.seconds is not None and one.relative_error is not None]
+        fit = [one.seconds for one in solved if one.relative_error <= error]
+        taken.append(min([*fit, solver.seconds]))
         ratios.append(taken[-1] / answer)
     if not taken:
         return "-"
     return times_as_long(taken, ratios)
 
 
-def over_the_scenes(scenes: Sequence[dict[str, Any]]) -> str:
+def over_the_scenes(scenes: Sequence[DeepestFrame]) -> str:
     """How the errors of the answers are spread, and which scenes are the worst."""
-    errors = {scene["name"]: 100 * scene["relative_error"] for scene in scenes if scene["relative_error"] is not None}
+    errors = {scene.name: 100 * scene.relative_error for scene in scenes if scene.relative_error is not None}
     low, middle, high = np.quantile(list(errors.values()), (0.1, 0.5, 0.9))
     worst = ", ".join(f"{name} {errors[name]:.2g} %" for name in sorted(errors, key=lambda n: -errors[n])[:SHOWN_WORST])
     return (
@@ -41,13 +41,13 @@ def over_the_scenes(scenes: Sequence[dict[str, Any]]) -> str:
     )
 
 
-def settings_tried(rows: Iterable[dict[str, Any]]) -> str:
+def settings_tried(rows: Mapping[str, DeepestFrames]) -> str:
     """In how many settings the solver was run, such as "13 settings": rows may be older than some of them."""
     titles: dict[str, list[str]] = {}
-    for row in rows:
-        names = {name for scene in row["scenes"] if scene["solver"] for name in scene["solver"]["variants"]}
+    for title, frames in rows.items():
+        names = {name for scene in frames.scenes if scene.solver for name in scene.solver.variants}
         if names:
-            titles.setdefault(_settings(names), []).append(row["row"]["title"])
+            titles.setdefault(_settings(names), []).append(title)
     first, *others = sorted(titles, key=lambda text: int(text.split()[0])) or [
         _settings({variant.name for variant in VARIANTS})
     ]

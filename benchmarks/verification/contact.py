@@ -8,7 +8,7 @@ from ast_sim.mechanics.case import SolidCase
 from ast_sim.mechanics.contact_and_friction import Contact, ContactSettings
 from ast_sim.mechanics.elements.elasticity import Elasticity
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean
-from ast_sim.mechanics.quasi_static import quasi_static
+from ast_sim.mechanics.solid_frames import quasi_static
 from ast_sim.mechanics.solver import SolverSettings
 from ast_sim.scene import NodeType, Scene
 from ast_sim.simulate.shapes import mesh

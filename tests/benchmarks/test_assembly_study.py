@@ -1,7 +1,7 @@
 """The study of own assemblies, from end to end on a block that a punch presses."""
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import pytest
 from simulate.own_assembly.assemblies import write_assembly
@@ -26,18 +26,27 @@ def small(monkeypatch, tmp_path, one_thread):
 def test_a_product_is_simulated_learned_and_measured(small):
     (small / "results").mkdir()
     assembly.main(["--folder", str(small / "data")])
-    found = json.loads(assembly.RESULTS.read_text())["small"]
-    assert len(found["scenes"]) == len(found["curves"]) == 2 and found["solver"]["scenes"] == 1
-    assert found["no_solver"] is None and found["generation_minutes"] > 0
-    assert len(found["solver_curves"]) == 1 and found["solver_curves"][0] > 0
-    for curve, scene in zip(found["curves"], found["scenes"], strict=True):
-        assert curve["frames"] == 2 and curve["true_reaction"] > 0.1 and curve["seconds"] > 0
-        assert curve["relative_error"] == pytest.approx(scene["relative_error"], rel=1e-3)  # there is no friction
-        assert curve["reaction"] == pytest.approx(curve["reaction_alone"], rel=1e-3)
+    one = assembly.MeasuredProduct.from_json(json.loads(assembly.RESULTS.read_text())["small"])
+    scenes = one.deepest.scenes
+    assert len(scenes) == len(one.curves) == 2 and one.deepest.solver.scenes == 1
+    assert one.deepest.no_solver is None and one.generation_minutes > 0
+    assert len(one.solver_curves) == 1 and one.solver_curves[0] > 0
+    for curve, scene in zip(one.curves, scenes, strict=True):
+        assert curve.frames == 2 and curve.true_reaction > 0.1 and curve.seconds > 0
+        assert curve.relative_error == pytest.approx(scene.relative_error, rel=1e-3)  # there is no friction
+        assert curve.reaction == pytest.approx(curve.reaction_alone, rel=1e-3)
     alone, together = (line for line in assembly.PAGE.read_text().splitlines() if line.startswith("| Bumper"))
-    error = sum(abs(curve["reaction"] / curve["true_reaction"] - 1) for curve in found["curves"]) / 2
+    error = sum(abs(curve.reaction / curve.true_reaction - 1) for curve in one.curves) / 2
     assert f"{100 * error:.2g} %, median" in together and ("questions" in alone or "never" in alone)
     assert json.loads((small / "data" / "run_later_2" / "run.json").read_text())["start"]["step"] in (2, 4)
+
+
+def test_the_page_is_the_one_that_the_results_make():
+    results = json.loads(assembly.RESULTS.read_text())
+    assert assembly.page(results) + "\n" == assembly.PAGE.read_text()
+    for values in results.values():
+        deepest = assembly.MeasuredProduct.from_json(values).deepest
+        assert json.loads(json.dumps(asdict(deepest))) == values["deepest"]
 
 
 def test_an_unknown_row_is_named(capsys):

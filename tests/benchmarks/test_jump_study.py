@@ -6,7 +6,7 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 
-from ast_sim.inference.effort import DIALS, Effort
+from ast_sim.inference.effort import Effort
 from benchmarks.studies import jumps
 
 
@@ -31,21 +31,31 @@ def test_a_row_is_trained_measured_and_shown_and_found_again(small):
     (small / "results").mkdir()
     jumps.main(["--folder", str(small / "data")])
     found = json.loads(jumps.RESULTS.read_text())
-    row, walk = found["small"], found["walk"]
-    assert len(row["scenes"]) == 2 and row["solver"]["scenes"] == 1 and walk["solver"] is None
-    assert len(row["by_calls"]) == 1 + sum(row["effort"][dial] for dial in DIALS)
-    dial = {(turned["corrections"], turned["newton_steps"]): turned for turned in row["dial"]}
-    assert set(dial) == {(0, 0), (1, 0), (2, 0), (3, 0), *((c, n) for c in (0, 1) for n in (1, 2, 10))}
-    assert np.mean(dial[1, 2]["relative_error"]) != np.mean(dial[1, 0]["relative_error"])
-    assert row["by_calls"][0] == pytest.approx(np.mean(dial[0, 0]["relative_error"]), rel=1e-6)
-    default = dial[row["effort"]["corrections"], row["effort"]["newton_steps"]]
-    assert row["relative_error"] == pytest.approx(np.mean(default["relative_error"]), rel=1e-6)
-    assert walk["effort"] == asdict(Effort()) and walk["by_calls"] == walk["dial"] == []
+    row, walk = (jumps.MeasuredRow.from_json(found[name]) for name in ("small", "walk"))
+    assert len(row.deepest.scenes) == 2 and row.deepest.solver.scenes == 1 and walk.deepest.solver is None
+    assert len(row.deepest.after_calls) == 1 + row.effort.corrections
+    assert len(row.deepest.after_newton_steps) == row.effort.newton_steps
+    dial = {turned.effort: turned for turned in row.dial}
+    calls = [Effort(corrections) for corrections in range(4)]
+    assert set(dial) == {*calls, *(Effort(c, n) for c in (0, 1) for n in (1, 2, 10))}
+    assert np.mean(dial[Effort(1, 2)].relative_error) != np.mean(dial[Effort(1)].relative_error)
+    assert row.deepest.after_calls[0] == pytest.approx(np.mean(dial[Effort()].relative_error), rel=1e-6)
+    assert row.deepest.relative_error == pytest.approx(np.mean(dial[row.effort].relative_error), rel=1e-6)
+    assert walk.effort == Effort() and walk.deepest.after_calls == () and walk.dial == []
     text = jumps.PAGE.read_text()
-    assert f"{100 * row['relative_error']:.1f} ±" in text and "times as long" in text and "every frame" in text
+    assert f"{100 * row.deepest.relative_error:.1f} ±" in text and "times as long" in text and "every frame" in text
     assert text.count("\n## ") == 2 and "Worst: test/" in text
     jumps.main(["walk", "--folder", str(small / "data")])  # nothing is trained again
-    assert json.loads(jumps.RESULTS.read_text())["walk"]["relative_error"] == walk["relative_error"]
+    again = jumps.MeasuredRow.from_json(json.loads(jumps.RESULTS.read_text())["walk"])
+    assert again.deepest.relative_error == walk.deepest.relative_error
+
+
+def test_the_page_is_the_one_that_the_results_make():
+    results = json.loads(jumps.RESULTS.read_text())
+    assert jumps.page(results) + "\n" == jumps.PAGE.read_text()
+    for values in results.values():
+        deepest = jumps.MeasuredRow.from_json(values).deepest
+        assert json.loads(json.dumps(asdict(deepest))) == values["deepest"]
 
 
 def test_an_unknown_row_is_named(capsys):

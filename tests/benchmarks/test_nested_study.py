@@ -1,9 +1,12 @@
 """The study of nested iteration, from end to end on a scene of 100 nodes."""
 
 import json
+from dataclasses import replace
 
 import pytest
+from chosen_figures import NO_DEEPEST
 
+from ast_sim.figures import DeepestFrame, SolverFigures, VariantFigures
 from ast_sim.simulate.jobs.fastest_solver import VARIANTS
 from benchmarks.studies import nested
 from benchmarks.studies.phrases import settings_tried
@@ -63,14 +66,16 @@ def test_a_faster_time_is_kept():
 
 
 def test_rows_say_in_how_many_settings_the_solver_was_run():
-    def row(title, *names):
-        return {"row": {"title": title}, "scenes": [{"solver": {"variants": dict.fromkeys(names)}}, {"solver": None}]}
+    def solved(*names):
+        solver = SolverFigures(1.0, None, None, dict.fromkeys(names, VariantFigures()))
+        frame = DeepestFrame("test/000000", 400, 1, 0.1, 0.01, (0.01,), (), 0.01, None, None, None)
+        return replace(NO_DEEPEST, scenes=(replace(frame, solver=solver), frame))
 
     plain = [variant.name for variant in VARIANTS[:13]]
     every = [variant.name for variant in VARIANTS]
-    old = [row("A", *plain), row("B", *plain)]
+    old = {"A": solved(*plain), "B": solved(*plain)}
     assert settings_tried(old) == "13 settings"
-    assert settings_tried([row("C", *every)]) == settings_tried([]) == "36 settings, nested iteration among them,"
-    assert settings_tried([*old, row("C", *every), row("D", *every)]) == (
+    assert settings_tried({"C": solved(*every)}) == settings_tried({}) == "36 settings, nested iteration among them,"
+    assert settings_tried({**old, "C": solved(*every), "D": solved(*every)}) == (
         "13 settings (36, nested iteration among them, for C, D)"
     )

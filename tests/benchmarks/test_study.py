@@ -13,7 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import toy
+from chosen_figures import evaluation
 
+from ast_sim.figures import MeanError
 from ast_sim.inference.answer import Answer
 from ast_sim.mechanics.unfinished import Checkpoint
 from ast_sim.runs.config_toml import read_config
@@ -24,7 +26,10 @@ from benchmarks.studies import __main__ as study
 from benchmarks.studies import page as study_page
 from benchmarks.studies import run as study_run
 from benchmarks.studies.measure import phase_errors, phases, repeated
+from benchmarks.studies.measured_run import MeasuredRun
 from benchmarks.studies.plan import Data, Entry, Study, read
+
+RESULTS = Path(__file__).parents[2] / "benchmarks" / "results"
 
 TOML = """
 title = "Toy"
@@ -300,6 +305,20 @@ def page(folder, found, summary) -> None:
     assert (folder / "pages/study/toy.svg").read_text().startswith("<?xml")
 
 
+def test_measured_runs_are_read_again():
+    files = sorted(RESULTS.glob("study_*.json"))
+    for file in files:
+        for model in json.loads(file.read_text())["models"].values():
+            for values in (run["measured"] for run in model["runs"]):
+                one = MeasuredRun.from_json(values)
+                assert json.loads(json.dumps(one.to_json())) == values
+                assert (
+                    one.error("displacement").rmse_sequence > 0
+                    and one.error("stress", "hold_still").rmse_pooled is None
+                )
+    assert len(files) == 5
+
+
 def size_of(model: str, nodes: int, seconds: float | None) -> dict:
     found = {"failed": "no memory"} if seconds is None else {"seconds": {"min": seconds}, "peak_resident_bytes": 2e9}
     return {"model": model, "nodes": nodes, **found}
@@ -319,13 +338,9 @@ def test_the_page_tells_what_the_size_of_a_mesh_costs(tmp_path):
 
 
 def run_of(rollout: float | None, milliseconds: float) -> dict:
-    summary = {"rollout_all": {"normal": {"rmse_sequence": rollout}}}
-    return {
-        "seed": 0,
-        "seconds_per_step": 4e-3 * milliseconds,
-        "batch": 4,
-        "measured": {"errors": {"displacement": {"model": summary}}},
-    }
+    error = MeanError("displacement", "model", "rollout_all", "normal", rollout, None)
+    measured = MeasuredRun(replace(evaluation({}), errors=(error,)), 1000, {}, 10, {}, 1.0)
+    return {"seed": 0, "seconds_per_step": 4e-3 * milliseconds, "batch": 4, "measured": measured}
 
 
 def test_the_seeds_of_most_rows_come_first():

@@ -117,6 +117,12 @@ def test_commands_on_a_page_are_taken(page, capsys):
             assert end.code == 0, f"{page_name(page)}: ast-sim {shlex.join(call)}\n{capsys.readouterr().err}"
 
 
+@pytest.mark.parametrize("page", [page for page in PAGES if page.parent.name != "reference"], ids=page_name)
+def test_pages_import_from_the_packages_not_from_what_is_in_them(page):
+    code = program([block for block in blocks(page.read_text(encoding="utf-8")) if block.kind == "python"])
+    assert re.findall(r"^ *(?:from|import) (ast_sim\.\w+\.\S+)", code, re.M) == []
+
+
 def test_blocks_are_found():
     page = (
         "# A\n\n```python\nx = 1\n```\n\n<!-- test: slow -->\n```python\nx = 2\n```\n\n"

@@ -56,7 +56,7 @@ def test_errors_are_shares_of_the_displacement(one):
     free = ~truth.scene.prescribed
     size = np.sqrt(np.mean(np.square((truth.position[frame] - truth.position[0])[free].astype(float))))
     assert (scene.name, scene.frame, scene.displacement) == ("test/000000", frame, pytest.approx(size))
-    assert scene.by_calls == pytest.approx([0.25, 0.25**2, 0.25**3], rel=1e-4)
+    assert scene.after_calls == pytest.approx([0.25, 0.25**2, 0.25**3], rel=1e-4) and scene.after_newton_steps == ()
     assert scene.relative_error == pytest.approx(0.25**3, rel=1e-4) and scene.seconds > 0
     there = truth.stress[frame][truth.scene.deforming("node")].astype(float)
     assert scene.stress_share == pytest.approx(0.25 * np.sqrt(np.mean(there**2)) / there.std(), rel=1e-5)
@@ -105,9 +105,9 @@ def test_newton_steps_lead_from_the_answer_to_equilibrium(pressed, monkeypatch):
     )
     monkeypatch.setattr(jumping_scene, "STILL", 0.0)
     found = deepest_frames(model, pressed, "test", Effort(1, 3)).scenes[0]
-    errors = found.by_calls
-    assert errors[:2] == pytest.approx([0.3, 0.09], rel=1e-3)
-    assert errors[2] < 0.4 * errors[1] and errors[-1] < 0.015 and found.relative_error == errors[-1]
+    calls, steps = found.after_calls, found.after_newton_steps
+    assert calls == pytest.approx([0.3, 0.09], rel=1e-3) and len(steps) == 3
+    assert steps[0] < 0.4 * calls[1] and steps[-1] < 0.015 and found.relative_error == steps[-1]
     assert found.stress_share < 0.05 and found.largest_stress < 0.05
     (answer,) = answers(model, [Question.of(truth, "plate", [frame])], Effort(1, 3))
     held = truth.scene.prescribed
@@ -118,10 +118,10 @@ def test_newton_steps_lead_from_the_answer_to_equilibrium(pressed, monkeypatch):
     assert [one.steps for one in measured] == [0, 1, 2, 3] * 2
     assert measured[7].stress_error == pytest.approx(found.stress_share)
     assert measured[5].stress_error > 1.1 * measured[7].stress_error
-    assert tuple(one.error for one in measured[4:]) == errors[1:] and measured[0].error == errors[0]
+    assert [one.error for one in measured[4:]] == [calls[1], *steps] and measured[0].error == calls[0]
     monkeypatch.setattr(NewtonSteps, "step", collapse)
     fallen = errors_by_effort(model, truth, [Effort(0, 3), Effort(1, 3)])
-    assert [one.error for one in fallen] == [errors[0], None, None, None, errors[1], None, None, None]
+    assert [one.error for one in fallen] == [calls[0], None, None, None, calls[1], None, None, None]
     assert [EffortErrors.from_json(json.loads(json.dumps(asdict(one)))) for one in fallen] == fallen
 
 
@@ -133,8 +133,8 @@ def test_newton_steps_that_do_not_end_begin_again_after_more_corrections(pressed
     assert first.steps == [10] and first.last_step[0] > STILL  # with 0.36 of the way missing
     (again,) = answer_steps(model, question, Effort(3, 10))  # with 0.13 missing
     (answer,) = answers(model, question, Effort(1, 10))
-    assert answer.converged and np.array_equal(answer.position[0], again.position[-1, 0])
-    assert np.array_equal(answer.stress[0], again.stress[-1, 0]) and answer.seconds > 0
+    assert answer.converged and np.array_equal(answer.position[0], again.after_newton_steps[-1][0])
+    assert np.array_equal(answer.stress[0], again.stress_after_newton_steps[-1][0]) and answer.seconds > 0
     size = np.linalg.norm((truth.position[frame] - truth.position[0])[free])
     assert np.linalg.norm((answer.position[0] - truth.position[frame])[free]) < 0.02 * size
     (nine,) = answers(model, question, Effort(1, 9))
@@ -148,7 +148,7 @@ def test_newton_steps_that_do_not_end_begin_again_after_more_corrections(pressed
     monkeypatch.setattr(NewtonSteps, "step", fail_later)
     (kept,) = answers(model, question, Effort(1, 10))
     assert len(made) == 11 and kept.failure is None and kept.converged is False
-    assert np.array_equal(kept.position[0], first.position[-1, 0])
+    assert np.array_equal(kept.position[0], first.after_newton_steps[-1][0])
 
 
 def test_friction_knows_the_frame_before_if_that_is_wanted_too(pressed, monkeypatch):
@@ -200,20 +200,26 @@ def test_newton_steps_end_when_one_is_small(pressed, monkeypatch):
     monkeypatch.setattr(jumping_scene, "STILL", 0.0)
     (all_steps,) = answer_steps(model, question, Effort(1, 6))
     newton = law_of(model.config).newton_steps(truth.scene)
-    sizes = [newton.size(*all_steps.position[k : k + 2, 0].astype(float)) for k in range(1, 7)]
+    positions = [all_steps.after_calls[-1], *all_steps.after_newton_steps]
+    sizes = [newton.size(*(one[0].astype(float) for one in pair)) for pair in itertools.pairwise(positions)]
     assert sizes == sorted(sizes, reverse=True) and sizes[0] > STILL > sizes[-1]
     assert all_steps.steps == [6] and all_steps.last_step[0] == pytest.approx(sizes[-1], abs=1e-5)
     monkeypatch.undo()
     needed = next(k for k, size in enumerate(sizes, 1) if size <= STILL)
     (ended,) = answer_steps(model, question, Effort(1, 6))
     assert ended.steps == [needed] and ended.last_step[0] == pytest.approx(sizes[needed - 1], rel=1e-3)
-    assert np.array_equal(ended.position[: 2 + needed], all_steps.position[: 2 + needed])
-    assert np.array_equal(ended.position[2 + needed :], np.repeat(ended.position[1 + needed][None], 6 - needed, axis=0))
-    assert np.array_equal(ended.stress[1:needed], all_steps.stress[1:needed]) and len(ended.stress) == 7
+    assert np.array_equal(ended.after_calls, all_steps.after_calls)
+    assert np.array_equal(ended.after_newton_steps[:needed], all_steps.after_newton_steps[:needed])
+    last = ended.after_newton_steps[needed - 1]
+    assert len(ended.after_newton_steps) == 6 and all(
+        np.array_equal(one, last) for one in ended.after_newton_steps[needed:]
+    )
+    assert np.array_equal(ended.stress_after_newton_steps[:needed], all_steps.stress_after_newton_steps[:needed])
+    assert len(ended.stress_after_newton_steps) == 6
     (answer,) = answers(model, question, Effort(1, 6))
     assert answer.converged and answer.last_steps == (ended.last_step[0],)
-    assert np.array_equal(answer.position[0], ended.position[-1, 0]) and np.array_equal(
-        answer.stress[0], ended.stress[-1, 0]
+    assert np.array_equal(answer.position[0], last[0]) and np.array_equal(
+        answer.stress[0], ended.stress_after_newton_steps[-1][0]
     )
     assert answer.trajectory.attributes["last_newton_steps"] == list(answer.last_steps)
     (short,) = answers(model, question, Effort(1, 1))

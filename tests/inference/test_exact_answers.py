@@ -8,10 +8,12 @@ import pytest
 import ast_sim
 from ast_sim.cli import main
 from ast_sim.inference.effort import choices
+from ast_sim.inference.evaluation.deepest_frames import deepest_frames
 from ast_sim.material import Material
 from ast_sim.mechanics.equilibria import Equilibria
 from ast_sim.mechanics.linearised.linearised_contact import NewtonSteps
 from ast_sim.mechanics.physics_check import Law
+from ast_sim.simulate.jobs.fastest_solver import deepest_frame
 from ast_sim.support.errors import ConfigError, SimulationError
 
 FROM_MODEL = "solved to the stop test of the solver, from the answer of the model"
@@ -104,6 +106,28 @@ def test_a_frame_whose_newton_steps_fail_is_solved(plates, monkeypatch):
     effort = ast_sim.Effort(newton_steps=1, solved=True, solved_beyond=0.5)
     answer = run.predict(truth, frames=[1], effort=effort)
     assert answer.source["solved"] == ALONG_LOAD_PATH and answer.errors(truth)["displacement"] < 1e-5
+    with run.open(plates) as data:
+        (scene,) = deepest_frames(run.model, data, "test", effort, most_scenes=1).scenes
+    assert scene.relative_error < 1e-5 < scene.after_calls[0] and scene.after_newton_steps == ()
+
+
+def test_scenes_that_the_solver_ends_are_evaluated_beside_others(plates):
+    run = ast_sim.example_run("plates")
+    one_step = ast_sim.Effort(newton_steps=1)
+    moves = []
+    for truth in loaded(plates):
+        frame = [deepest_frame(truth)]
+        called, stepped = (run.predict(truth, frames=frame, effort=one) for one in (ast_sim.Effort(), one_step))
+        free = truth.scene.deforming_nodes & ~truth.scene.prescribed
+        move = np.linalg.norm((stepped.position - called.position)[0, free])
+        moves.append(move / np.linalg.norm(stepped.displacement[0, free]))
+    effort = replace(one_step, solved=True, solved_beyond=float(np.median(moves)))
+    with run.open(plates) as data:
+        some, none = (deepest_frames(run.model, data, "test", one) for one in (effort, one_step))
+    ended = [scene.relative_error != scene.after_newton_steps[0] for scene in some.scenes]
+    assert ended == [move > np.median(moves) for move in moves] and sum(ended) == 2
+    assert (some.after_calls, some.after_newton_steps) == (none.after_calls, none.after_newton_steps)
+    assert none.after_newton_steps[0] == pytest.approx(none.relative_error, rel=1e-12)
 
 
 def test_a_poor_start_makes_the_solver_go_the_way_of_the_load(plates, monkeypatch):

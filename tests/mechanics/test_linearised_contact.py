@@ -14,7 +14,7 @@ from ast_sim.mechanics.elements.neo_hookean import NeoHookean
 from ast_sim.mechanics.linear_algebra import compliance
 from ast_sim.mechanics.linearised import linearised_contact
 from ast_sim.mechanics.linearised.linearised_contact import STILL, NewtonSteps
-from ast_sim.mechanics.quasi_static import quasi_static, solve_frame
+from ast_sim.mechanics.solid_frames import quasi_static, solve_frame
 from ast_sim.scene import NodeType
 from ast_sim.simulate.families import assembly
 from ast_sim.simulate.own_assembly.parameters import completed

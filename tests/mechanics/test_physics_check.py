@@ -9,7 +9,7 @@ from solids import blocks, pressed
 
 from ast_sim.material import Material
 from ast_sim.mechanics.physics_check import Law, check_physics
-from ast_sim.mechanics.quasi_static import solve_frame
+from ast_sim.mechanics.solid_frames import solve_frame
 from ast_sim.simulate.families import assembly
 
 

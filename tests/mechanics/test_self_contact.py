@@ -15,7 +15,7 @@ from ast_sim.mechanics.elements.neo_hookean import NeoHookean
 from ast_sim.mechanics.linearised.linearised_contact import CLEARANCE, NewtonSteps
 from ast_sim.mechanics.linearised.near_pairs import NearSurfaces
 from ast_sim.mechanics.physics_check import Law, check_physics
-from ast_sim.mechanics.quasi_static import solve_frame
+from ast_sim.mechanics.solid_frames import solve_frame
 from ast_sim.scene import NodeType, Scene
 
 RANGE = 5e-4

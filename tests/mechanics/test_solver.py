@@ -11,7 +11,7 @@ from ast_sim.mechanics.contact_and_friction import Contact, ContactSettings
 from ast_sim.mechanics.elements.elasticity import Elasticity
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean
 from ast_sim.mechanics.load_halving import QuasiStatic
-from ast_sim.mechanics.quasi_static import quasi_static
+from ast_sim.mechanics.solid_frames import quasi_static
 from ast_sim.mechanics.solver import Newton, NotConverged, SolverSettings
 from ast_sim.mechanics.unfinished import Checkpoint
 from ast_sim.simulate.shapes import mesh

@@ -96,7 +96,7 @@ def test_turning_points_are_predicted_first_and_are_the_starts(data, tmp_path, n
     assert np.array_equal(carried[scene.prescribed], truth.position[5][scene.prescribed])
     assert torch.equal(carried[~torch.from_numpy(scene.prescribed)], there[~torch.from_numpy(scene.prescribed)])
     (way,) = answer_steps(model, [Question.of(truth, "scene", [5, LAST])], Effort())
-    assert np.array_equal(way.position[0], answer.position)
+    assert np.array_equal(way.after_calls[0], answer.position)
 
 
 def test_a_turning_point_that_fails_takes_what_starts_from_it_along(data, tmp_path):

@@ -93,17 +93,17 @@ def test_each_call_corrects_the_answer_of_the_call_before():
     truth, model = toy.plate(1), Halving(config("ast"))
     free = ~truth.scene.prescribed
     question = Question.of(truth, "scene", [2, -1])
-    ((found, stress, steps, _),) = answer_steps(model, [question], Effort(3))
-    assert steps.tolist() == [0, 0]
-    assert found.shape == (4, 2, truth.scene.num_nodes, 3)
+    (steps,) = answer_steps(model, [question], Effort(3))
+    assert steps.steps.tolist() == [0, 0] and steps.after_newton_steps == steps.stress_after_newton_steps == []
+    assert [one.shape for one in steps.after_calls] == 4 * [(2, truth.scene.num_nodes, 3)]
     start = truth.position[0, free]
-    for call in range(4):
-        way = (found[call, :, free] - start[:, None])[..., 0]
+    for call, position in enumerate(steps.after_calls):
+        way = (position[:, free] - start)[..., 0]
         np.testing.assert_allclose(way, 0.01 * (1 - 0.5 ** (call + 1)), rtol=0, atol=1e-7)
-        assert np.array_equal(found[call][:, ~free], truth.position[[2, 6]][:, ~free])
+        assert np.array_equal(position[:, ~free], truth.position[[2, 6]][:, ~free])
     (answer,) = answers(model, [question], Effort(3))
-    assert np.array_equal(answer.position, found[3]) and answer.frames == (2, 6) and answer.computed.all()
-    assert len(answer.stress) == 2 == len(answer.step_seconds) and np.array_equal(stress[0], answer.stress)
+    assert np.array_equal(answer.position, steps.after_calls[-1]) and answer.frames == (2, 6) and answer.computed.all()
+    assert len(answer.stress) == 2 == len(answer.step_seconds) and np.array_equal(steps.stress, answer.stress)
 
 
 def test_only_the_wanted_frames_are_computed(monkeypatch):

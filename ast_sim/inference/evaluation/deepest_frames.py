@@ -8,6 +8,7 @@ is prepared for a mesh, for the model and for the solver.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import os
 import statistics
 from collections.abc import Callable, Iterable, Sequence
@@ -19,7 +20,7 @@ from ast_sim.dataset.reader import Dataset
 from ast_sim.figures import Beside, DeepestFrame, DeepestFrames, SolverFigures, VariantFigures
 from ast_sim.inference.answering import answers
 from ast_sim.inference.effort import Effort, EffortErrors
-from ast_sim.inference.predicting.jump import answer_steps
+from ast_sim.inference.predicting.jump import AnswerSteps, answer_steps
 from ast_sim.inference.predicting.question import Question
 from ast_sim.inference.quantities.relative_errors import displacement, relative_error, stress_errors
 from ast_sim.mechanics.linearised.linearised_contact import STILL
@@ -69,7 +70,8 @@ def deepest_frames(
         relative_error=_mean([scene.relative_error for scene in known]),
         stress_share=_mean([scene.stress_share for scene in known]),
         largest_stress=_mean([scene.largest_stress for scene in known]),
-        by_calls=tuple(np.mean([scene.by_calls for scene in known], axis=0).tolist()) if known else (),
+        after_calls=_means([scene.after_calls for scene in known]),
+        after_newton_steps=_means([scene.after_newton_steps for scene in known]),
         seconds=statistics.median(scene.seconds for scene in known) if known else None,
         not_converged=sum((scene.last_step or 0) > STILL for scene in known),
         solver=_beside([(scene, scene.solver.seconds) for scene in known if scene.solver]),
@@ -121,31 +123,40 @@ def errors_by_effort(model: Simulator, truth: Trajectory, efforts: Sequence[Effo
 def _after(model: Simulator, truth: Trajectory, frame: int, most: Effort) -> list[EffortErrors]:
     """The errors after 0 Newton steps up to the number of an effort."""
     efforts = [dataclasses.replace(most, newton_steps=steps) for steps in range(most.newton_steps + 1)]
-    question = Question.of(truth, "validation", [frame])
-    (outcome,) = answer_steps(model, [question], most)
-    if isinstance(outcome, str) and most.newton_steps:  # a Newton step failed; the calls before it still count
-        (outcome,) = answer_steps(model, [question], efforts[0])
-    if isinstance(outcome, str):
+    outcome = _steps_to_answer(model, Question.of(truth, "validation", [frame]), most)
+    if outcome is None:
         return [EffortErrors(effort, None, None, 0, 0) for effort in efforts]
-    positions = outcome.position[most.corrections :]
     needed = int(outcome.steps[0]) + bool(outcome.last_step[0] > STILL)
+    positions = [outcome.after_calls[-1], *outcome.after_newton_steps]
+    stresses = [outcome.stress, *outcome.stress_after_newton_steps]
     measured = []
-    for steps, effort in enumerate(efforts):
-        if steps >= len(positions):
+    for effort, position, stress in itertools.zip_longest(efforts, positions, stresses):
+        if position is None:  # a Newton step failed
             measured.append(EffortErrors(effort, None, None, 0, 0))
             continue
-        error = relative_error(positions[steps][0], truth, frame)
-        stress = None if outcome.stress is None else outcome.stress[steps][0]
-        stress_error, _ = stress_errors(truth, stress, frame, model.config.data.stress)
-        measured.append(EffortErrors(effort, error, stress_error, min(steps, needed), float(0 < steps < needed)))
+        error = relative_error(position[0], truth, frame)
+        in_frame = None if stress is None else stress[0]
+        stress_error, _ = stress_errors(truth, in_frame, frame, model.config.data.stress)
+        made = min(effort.newton_steps, needed)
+        measured.append(EffortErrors(effort, error, stress_error, made, float(0 < effort.newton_steps < needed)))
     return measured
+
+
+def _steps_to_answer(model: Simulator, question: Question, effort: Effort) -> AnswerSteps | None:
+    """The steps to an answer, or its calls alone if a Newton step failed; None: these failed, too."""
+    calls_alone = dataclasses.replace(effort, newton_steps=0, solved=False, solved_beyond=0.0)
+    for tried in dict.fromkeys([effort, calls_alone]):
+        (outcome,) = answer_steps(model, [question], tried)
+        if not isinstance(outcome, str):
+            return outcome
+    return None
 
 
 def lines(frames: DeepestFrames) -> list[str]:
     """The most important figures as sentences."""
     if frames.relative_error is None or frames.seconds is None:
         return ["the deepest frame: every prediction failed"]
-    after = [f"{100 * error:.3g}" for error in frames.by_calls]
+    after = [f"{100 * error:.3g}" for error in (*frames.after_calls, *frames.after_newton_steps)]
     told = [
         f"the deepest frame at once: error {percent(frames.relative_error, 3)} of the displacement,"
         f" {measured_time(frames.seconds)} in the median, on one thread"
@@ -197,11 +208,9 @@ def _scene(model: Simulator, dataset: Dataset, split: str, index: int, effort: E
     size = displacement(truth, frame)
     failed = answer.failure is not None or not size  # where nothing moves, there is no relative error
     stress = None if answer.stress is None or answer.failure is not None else answer.stress[0]
-    by_calls = []
-    if model.config.scheme.corrects and not failed:
-        (after,) = answer_steps(model, [question], effort)
-        positions = () if isinstance(after, str) else after.position
-        by_calls = [relative_error(position[0], truth, frame) for position in positions]
+    outcome = _steps_to_answer(model, question, effort) if model.config.scheme.corrects and not failed else None
+    after_calls = [] if outcome is None else outcome.after_calls
+    after_newton_steps = [] if outcome is None else outcome.after_newton_steps
     share, largest = stress_errors(truth, stress, frame, model.config.data.stress)
     return DeepestFrame(
         name=name,
@@ -209,7 +218,8 @@ def _scene(model: Simulator, dataset: Dataset, split: str, index: int, effort: E
         frame=frame,
         displacement=size,
         relative_error=None if failed else relative_error(answer.position[0], truth, frame),
-        by_calls=tuple(by_calls),
+        after_calls=tuple(relative_error(position[0], truth, frame) for position in after_calls),
+        after_newton_steps=tuple(relative_error(position[0], truth, frame) for position in after_newton_steps),
         seconds=answer.seconds,
         last_step=answer.last_steps[-1] if answer.last_steps else None,
         stress_share=share,
@@ -254,3 +264,9 @@ def _beside(scenes: list[tuple[DeepestFrame, float | None]]) -> Beside | None:
 def _mean(values: list[float | None]) -> float | None:
     known = [value for value in values if value is not None]
     return float(np.mean(known)) if known else None
+
+
+def _means(of_scenes: list[tuple[float, ...]]) -> tuple[float, ...]:
+    """The mean after each step over the scenes that have any."""
+    known = [errors for errors in of_scenes if errors]
+    return tuple(np.mean(known, axis=0).tolist()) if known else ()

@@ -11,12 +11,12 @@ an answer (`Effort.solved`).
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache
-from typing import NamedTuple
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from ast_sim.batches.carry import Carrier
 from ast_sim.inference.answer import Answer
@@ -54,46 +54,57 @@ def jumps(
     return [scene.answer() for scene in _predicted(model, questions, effort, progress)]
 
 
-class AnswerSteps(NamedTuple):
-    """The wanted frames of a scene on the way to the answer.
+@dataclass(frozen=True, eq=False)
+class AnswerSteps:
+    """The S wanted frames of a scene on the way to the answer, as far as the Newton steps lead.
+
+    Where a frame needed fewer Newton steps than another, its last positions and stresses are repeated.
 
     Attributes:
-        position: [1 + corrections + Newton steps, S, N, 3] float32, after the first call, each correction, and each
-            Newton step. Where a frame needed fewer Newton steps, its last positions are repeated; stress likewise.
-        stress: [1 + Newton steps, S, N or E, 1] float32, after the last call and each Newton step; None without stress.
+        after_calls: for the first call and each correction [S, N, 3] float32.
+        after_newton_steps: for each Newton step [S, N, 3] float32.
+        stress: [S, N or E, 1] float32, after the last call; None without stress.
+        stress_after_newton_steps: for each Newton step [S, N or E, 1] float32; empty without stress.
         steps: [S], the Newton steps that were made.
         last_step: [S], the size of the last one, NaN where none was made.
     """
 
-    position: np.ndarray
+    after_calls: list[np.ndarray]
+    after_newton_steps: list[np.ndarray]
     stress: np.ndarray | None
+    stress_after_newton_steps: list[np.ndarray]
     steps: np.ndarray
     last_step: np.ndarray
 
 
 def answer_steps(model: Simulator, questions: Sequence[Question], effort: Effort) -> list[AnswerSteps | str]:
     """For each scene the steps to its answer, or a text that says why a frame failed. Arguments and errors as for
-    `jumps`."""
+    `jumps`; the solver is left out."""
     outcomes: list[AnswerSteps | str] = []
-    for scene in _predicted(model, questions, effort, each_step=True):
+    for scene in _predicted(model, questions, replace(effort, solved=False, solved_beyond=0.0), each_step=True):
         if scene.failure is not None:
             outcomes.append(scene.failure)
             continue
-        count = 1 + effort.corrections + effort.newton_steps
         wanted = scene.wanted
-        position = [_stacked(frame.positions, count) for frame in wanted]
-        known = [frame for frame in wanted if model.config.data.stress != "none"]
-        stress = [_stacked([one[STRESS] for one in frame.fields], 1 + effort.newton_steps) for frame in known]
-        steps = np.array([len(frame.positions) - 1 - effort.corrections for frame in wanted])
-        last = np.array([np.nan if frame.last_step is None else frame.last_step for frame in wanted])
-        stresses = np.stack(stress, axis=1) if stress else None
-        outcomes.append(AnswerSteps(np.stack(position, axis=1), stresses, steps, last))
+        known = [frame.fields for frame in wanted if model.config.data.stress != "none"]
+        stresses = _by_step([[one[STRESS] for one in fields] for fields in known], 1 + effort.newton_steps)
+        outcomes.append(
+            AnswerSteps(
+                _by_step([frame.after_calls for frame in wanted], 1 + effort.corrections),
+                _by_step([frame.after_newton_steps for frame in wanted], effort.newton_steps),
+                stresses[0] if stresses else None,
+                stresses[1:],
+                np.array([len(frame.after_newton_steps) for frame in wanted]),
+                np.array([np.nan if frame.last_step is None else frame.last_step for frame in wanted]),
+            )
+        )
     return outcomes
 
 
-def _stacked(rows: list, count: int) -> np.ndarray:
-    """The rows, and the last one again until there are `count`."""
-    return torch.stack([*rows, *[rows[-1]] * (count - len(rows))]).numpy()
+def _by_step(rows: list[list[Tensor]], count: int) -> list[np.ndarray]:
+    """`count` times [S, ...]: what each frame has after each step, its last one again where it has fewer."""
+    padded = [of_frame + of_frame[-1:] * (count - len(of_frame)) for of_frame in rows]
+    return [torch.stack(same).numpy() for same in zip(*padded, strict=True)]
 
 
 def _predicted(
@@ -136,14 +147,14 @@ def _predicted(
 
 def _start_again(model: Simulator, frame: JumpingFrame, effort: Effort, progress: Progress) -> None:
     """Newton steps need a nearly right start: more corrections give a better one."""
-    first = (frame.positions, frame.fields, frame.last_step)
+    first = (frame.after_calls, frame.after_newton_steps, frame.fields, frame.last_step)
     spent = frame.seconds
     _predict(model, [frame], replace(effort, corrections=effort.corrections + AGAIN))
     frame.refine(effort.newton_steps, False, progress)
     frame.seconds += spent
     if frame.failure is not None:  # the first answer at least says that it has not converged
         frame.failure = None
-        (frame.positions, frame.fields, frame.last_step) = first
+        (frame.after_calls, frame.after_newton_steps, frame.fields, frame.last_step) = first
 
 
 def _waves(scenes: Sequence[JumpingScene]) -> Iterator[list[JumpingFrame]]:
@@ -188,9 +199,10 @@ def _predict(model: Simulator, group: list[JumpingFrame], effort: Effort) -> Non
         else:
             group[0].failure = f"{group[0].name}: {error}"
         return
-    for frame, (positions, fields, latent, seconds) in zip(group, predicted, strict=True):
-        frame.failure = not_finite(model.config, frame.scene.question.name, frame.number, positions[-1], fields)
-        frame.positions = positions
+    for frame, (after_calls, fields, latent, seconds) in zip(group, predicted, strict=True):
+        frame.failure = not_finite(model.config, frame.scene.question.name, frame.number, after_calls[-1], fields)
+        frame.after_calls = after_calls
+        frame.after_newton_steps = []
         frame.fields = [fields]
         frame.latent = latent
         frame.seconds = seconds

@@ -35,8 +35,9 @@ class JumpingFrame:
     Attributes:
         source: the frame that it starts from; None: the first one, which is given.
         start: made when the source is predicted.
-        positions: after each call and each Newton step.
-        fields: after the last call and after Newton steps, which change the stress alone.
+        after_calls, after_newton_steps: positions after each call and after each Newton step.
+        solution: positions where the solver ended; None: it did not solve the frame.
+        fields: after the last call, after Newton steps and of the solution; these change the stress alone.
         last_step: the size of the last Newton step.
         latent: what the network made of it in the first call.
         along_load_path: whether the solver followed the load path; None: it did not solve the frame.
@@ -46,7 +47,9 @@ class JumpingFrame:
     number: int
     source: JumpingFrame | None
     start: Start = field(init=False)
-    positions: list[Tensor] = field(default_factory=list)
+    after_calls: list[Tensor] = field(default_factory=list)
+    after_newton_steps: list[Tensor] = field(default_factory=list)
+    solution: Tensor | None = None
     fields: list[dict[str, Tensor]] = field(default_factory=list)
     last_step: float | None = None
     latent: np.ndarray | None = None
@@ -63,6 +66,11 @@ class JumpingFrame:
     def name(self) -> str:
         return f"{self.scene.question.name} frame {self.number}"
 
+    @property
+    def position(self) -> Tensor:
+        """The positions after all that was computed so far."""
+        return [*self.after_calls, *self.after_newton_steps][-1] if self.solution is None else self.solution
+
     def begin(self) -> None:
         """Make the start, when the source is predicted."""
         scene = self.scene
@@ -70,7 +78,7 @@ class JumpingFrame:
         if source is None:
             state = scene.state(scene.question.prescribed_position[0], scene.fields[0], self.number)
         elif source.failure is None:
-            state = scene.state(source.positions[-1].numpy(), source.fields[-1], self.number)
+            state = scene.state(source.position.numpy(), source.fields[-1], self.number)
         else:
             self.failure = source.failure
             return
@@ -94,7 +102,7 @@ class JumpingFrame:
         location = self.scene.model.config.data.stress
         try:
             solver = self.scene.solver(self.scene.question.scene)
-            position = _array(self.positions[-1])
+            position = _array(self.position)
             stuck = self.scene.refined_position(self.number - 1)
             patience = Patience(progress)
             for step in range(1, most + 1):
@@ -103,7 +111,7 @@ class JumpingFrame:
                 solver.watch = lambda forces, told=told: patience.tell(f"{told}, {forces:,} forces of contact so far")
                 before = position
                 position = solver.step(position, from_afar=step == 1, stuck=stuck)
-                self.positions.append(torch.from_numpy(position.astype(np.float32)))
+                self.after_newton_steps.append(torch.from_numpy(position.astype(np.float32)))
                 self.last_step = solver.size(before, position)
                 ends = step == most or self.last_step <= STILL
                 if location != "none" and (every_stress or ends):
@@ -122,22 +130,22 @@ class JumpingFrame:
             return math.inf
         scene = self.scene.question.scene
         free = scene.deforming_nodes & ~scene.prescribed
-        end = _array(self.positions[-1])[free]
-        move = np.linalg.norm(end - _array(self.positions[corrections])[free])
+        end = _array(self.position)[free]
+        move = np.linalg.norm(end - _array(self.after_calls[corrections])[free])
         return float(move / max(np.linalg.norm(end - scene.rest_position[free]), np.finfo(float).tiny))
 
     def solve(self) -> None:
         """Have the solver go on to its stop test, from where the Newton steps have ended, if they have not failed."""
-        if not self.positions:  # the model has failed
+        if not self.after_calls:  # the model has failed
             return
         began = time.perf_counter()
         location = self.scene.model.config.data.stress
-        start = _array(self.positions[-1]) if self.failure is None else None
+        start = _array(self.position) if self.failure is None else None
         try:
             position, self.along_load_path = self.scene.equilibria.solve(self.number, start)
             self.failure = None
             self.last_step = 0.0
-            self.positions.append(torch.from_numpy(position.astype(np.float32)))
+            self.solution = torch.from_numpy(position.astype(np.float32))
             if location != "none":
                 stress = self.scene.solver(self.scene.question.scene).von_mises(position, location)
                 self.fields.append({**self.fields[-1], STRESS: torch.from_numpy(stress)})
@@ -195,7 +203,7 @@ class JumpingScene:
         if number < self.given:
             return _array(self.prescribed_position[number]) if number in self.question.wanted() else None
         done = (frame for frame in self.frames if frame.last_step is not None and frame.failure is None)
-        return next((_array(frame.positions[-1]) for frame in done if frame.number == number), None)
+        return next((_array(frame.position) for frame in done if frame.number == number), None)
 
     @property
     def failure(self) -> str | None:
@@ -208,7 +216,7 @@ class JumpingScene:
         frames = dict(enumerate(zip(self.prescribed_position[: self.given], self.fields, strict=True)))
         return self.question.answer(
             self.model.config,
-            frames | {frame.number: (frame.positions[-1], frame.fields[-1]) for frame in predicted},
+            frames | {frame.number: (frame.position, frame.fields[-1]) for frame in predicted},
             [frame.seconds for frame in predicted],
             self.failure and f"{self.failure}; the frames before it are kept",
             {frame.number: frame.latent for frame in predicted},

@@ -15,12 +15,8 @@ from functools import partial
 import numpy as np
 
 from ast_sim.dataset.layout import DatasetInfo
-from ast_sim.mechanics.case import Drawn, SolidCase
-from ast_sim.mechanics.contact_and_friction import Contact, ContactSettings
-from ast_sim.mechanics.elements.neo_hookean import NeoHookean
-from ast_sim.mechanics.quasi_static import quasi_static
-from ast_sim.mechanics.solver import SolverSettings
-from ast_sim.mechanics.unfinished import Checkpoint
+from ast_sim.mechanics import Checkpoint, ContactSettings, Drawn, NeoHookean, SolidCase, SolverSettings, quasi_static
+from ast_sim.mechanics.contact_and_friction import Contact
 from ast_sim.scene import AttributeValue, NodeType, Scene, Trajectory
 from ast_sim.simulate.shapes.cad.gmsh_process import MeshingFailed
 from ast_sim.simulate.shapes.mesh_check import BadMesh

@@ -13,10 +13,7 @@ from typing import Any
 import numpy as np
 
 from ast_sim.dataset.layout import LENGTH_UNITS
-from ast_sim.mechanics.case import Drawn, SolidCase
-from ast_sim.mechanics.quasi_static import quasi_static
-from ast_sim.mechanics.solver import SolverSettings
-from ast_sim.mechanics.unfinished import Checkpoint
+from ast_sim.mechanics import Checkpoint, Drawn, SolidCase, SolverSettings, quasi_static
 from ast_sim.named_field import REACTION
 from ast_sim.scene import Trajectory
 from ast_sim.simulate.own_assembly.assembly_spec import AssemblySpec

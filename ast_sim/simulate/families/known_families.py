@@ -6,7 +6,7 @@ option), `draw(rng, nodes, ...) -> case`, which takes all of its draws from `rng
 `draw_geometry(rng, nodes, ...) -> Drawn`, which draws the same and can be meshed again. One with the option order also
 has `SECOND_ORDER_NODES`, the `MINIMUM_NODES` of such scenes. The family `assembly` has
 `info`, `check_spec` and `draw_scene` instead of `INFO` and the two: they depend on a specification.
-docs/how-to/new-family.md shows a family.
+What it needs of the solver is imported from `ast_sim.mechanics`. docs/how-to/new-family.md shows a family.
 """
 
 from __future__ import annotations

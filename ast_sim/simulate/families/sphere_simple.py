@@ -17,10 +17,7 @@ import numpy as np
 from scipy.spatial import Delaunay
 
 from ast_sim.dataset.layout import DatasetInfo
-from ast_sim.mechanics.contact_and_friction import ContactSettings
-from ast_sim.mechanics.dynamics import ClothCase, implicit_euler
-from ast_sim.mechanics.elements.cloth import ClothMaterial
-from ast_sim.mechanics.unfinished import Checkpoint
+from ast_sim.mechanics import Checkpoint, ClothCase, ClothMaterial, ContactSettings, implicit_euler
 from ast_sim.scene import NodeType, Scene, Trajectory
 
 FRAMES = 500

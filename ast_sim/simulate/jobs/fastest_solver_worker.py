@@ -27,8 +27,8 @@ from ast_sim.mechanics.driven import Driven
 from ast_sim.mechanics.elements.second_order import deforming_body
 from ast_sim.mechanics.equilibria import Equilibria
 from ast_sim.mechanics.linearised.linearised_contact import CLEARANCE, NewtonSteps
-from ast_sim.mechanics.quasi_static import OneFrame, solve_frame
 from ast_sim.mechanics.reaction import Reaction
+from ast_sim.mechanics.solid_frames import OneFrame, solve_frame
 from ast_sim.mechanics.solver import SolverSettings
 from ast_sim.scene import Scene
 from ast_sim.simulate.families.known_families import family_module

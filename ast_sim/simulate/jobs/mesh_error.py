@@ -21,8 +21,8 @@ from ast_sim.mechanics.case import SolidCase
 from ast_sim.mechanics.driven import Driven
 from ast_sim.mechanics.frames import GivenUp
 from ast_sim.mechanics.linearised.linearised_contact import CLEARANCE, STILL, NewtonSteps
-from ast_sim.mechanics.quasi_static import SolidFrames, solve_frame
 from ast_sim.mechanics.reaction import Reaction
+from ast_sim.mechanics.solid_frames import SolidFrames, solve_frame
 from ast_sim.scene import Trajectory
 from ast_sim.simulate.calculix import solve as calculix
 from ast_sim.simulate.families import assembly

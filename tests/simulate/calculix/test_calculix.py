@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ast_sim.mechanics import quasi_static as trajectory
+from ast_sim.mechanics import quasi_static
 from ast_sim.mechanics.case import SolidCase
 from ast_sim.mechanics.contact_and_friction import ContactSettings
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean
-from ast_sim.scene import NodeType, Scene
+from ast_sim.scene import NodeType, Scene, Trajectory
 from ast_sim.simulate.calculix import solve as calculix
 from ast_sim.simulate.calculix.ccx_results import read_increments, read_results
 from ast_sim.simulate.calculix.deck import Increments, contact_stiffness, slave_first, write_deck
@@ -126,7 +126,7 @@ def test_a_uniaxially_deformed_block_has_the_stress_of_the_closed_form():
 def test_both_solvers_agree_on_two_bodies_of_two_materials(friction, order):
     """The elements of second order are C3D10 in CalculiX; at a Poisson's ratio of 0.4 they are the same."""
     case = squeezed(friction=friction, order=order)
-    ours, referee = trajectory.quasi_static(case), calculix.quasi_static(case)
+    ours, referee = quasi_static(case), calculix.quasi_static(case)
     assert ours.attributes["status"] == referee.attributes["status"] == "complete"
     assert referee.attributes["kind"] == "boss" and referee.attributes["friction"] == friction
     figures = compare(case, ours, referee)
@@ -137,7 +137,7 @@ def test_both_solvers_agree_on_two_bodies_of_two_materials(friction, order):
 
 def test_both_solvers_agree_on_a_rigid_obstacle_on_a_bent_way():
     case = pressed()
-    ours, referee = trajectory.quasi_static(case), calculix.quasi_static(case)
+    ours, referee = quasi_static(case), calculix.quasi_static(case)
     referee.check(stress_location="node")
     assert referee.attributes["status"] == "complete"
     figures = compare(case, ours, referee)
@@ -158,7 +158,7 @@ def test_figures_tell_solutions_apart():
         position = (rest + factor * (case.prescribed_position - case.prescribed_position[0])).astype(np.float32)
         position[1, 0] += np.float32(factor * 0.1)  # a free node
         attributes = {"reaction": [0.0, 7 * factor]}
-        return trajectory.Trajectory(case.scene, position, factor * stress, attributes=attributes)
+        return Trajectory(case.scene, position, factor * stress, attributes=attributes)
 
     types = case.scene.node_type.copy()
     types[0] = NodeType.NORMAL
@@ -412,4 +412,4 @@ def test_metal_follows_its_hardening_and_keeps_its_plastic_strain():
     np.testing.assert_allclose(forces[:, upper, 2].sum(axis=1), stress * area, atol=2e-4 * young * 0.12)
     assert not forces[:, ~case.scene.prescribed].any()
     with pytest.raises(SimulationError, match="body 0 yields: use CalculiX"):
-        trajectory.quasi_static(case)
+        quasi_static(case)

@@ -6,8 +6,8 @@ import pytest
 from ast_sim.element_topology import MIDDLES, signed_volumes
 from ast_sim.mechanics.contact_and_friction import Contact
 from ast_sim.mechanics.driven import Driven
-from ast_sim.mechanics.quasi_static import solve_frame
 from ast_sim.mechanics.reaction import Reaction
+from ast_sim.mechanics.solid_frames import solve_frame
 from ast_sim.named_field import REACTION
 from ast_sim.scene import NodeType
 from ast_sim.simulate.families.deforming_plate import (

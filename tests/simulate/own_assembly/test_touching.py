@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from simulate.own_assembly.assemblies import box, case_of, write_box
 
-from ast_sim.mechanics.quasi_static import quasi_static
+from ast_sim.mechanics.solid_frames import quasi_static
 from ast_sim.simulate.families import assembly
 from ast_sim.simulate.own_assembly.rest_check import gap_between
 from ast_sim.simulate.own_assembly.touching import set_back
