@@ -125,7 +125,7 @@ class DeepestFrame:
         after_calls: the relative error after each call of a model that jumps; empty for another.
         after_newton_steps: the same after each Newton step; the last one again where fewer were needed. Empty where
             none was wanted, or one failed.
-        seconds: wall seconds of the answer.
+        seconds: processor time of the answer.
         last_step: the size of the last Newton step; None without.
         stress_share: the error of the stress over the error of the frame's true mean.
         largest_stress: the relative error of the largest stress.
