@@ -77,3 +77,15 @@ def test_unlike_pieces_of_files_that_other_files_list_are_refused(tmp_path):
     (tmp_path / "f.pvtu").write_text(f'<VTKFile type="PUnstructuredGrid">{grids}</VTKFile>')
     with pytest.raises(DatasetError, match=r"f_0\.vtu: its pieces have different fields, or the same in another order"):
         read_mesh(tmp_path / "f.pvtu")
+
+
+@pytest.mark.parametrize("name", ['Name=""', ""])
+@pytest.mark.parametrize("place", ["PointData", "CellData"])
+def test_a_field_without_a_name_is_refused(tmp_path, name, place):
+    write(tmp_path / "f.vtu", [grid(SCENES[0], 0, "a", 0)])
+    text = (tmp_path / "f.vtu").read_text()
+    old = 'Name="a"' if place == "PointData" else 'Name="a in cells"'
+    assert old in text
+    (tmp_path / "f.vtu").write_text(text.replace(old, name))
+    with pytest.raises(DatasetError, match=rf"f\.vtu: .* an array of its {place} has no name: name it"):
+        read_mesh(tmp_path / "f.vtu")
