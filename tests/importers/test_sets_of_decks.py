@@ -104,3 +104,12 @@ def test_a_set_with_the_name_of_an_instance_is_taken_with_a_note(tmp_path):
     mesh = read(tmp_path, *PARTS, "*NSET, NSET=high", "low.1, high.1", "*END ASSEMBLY")
     assert mesh.groups["high"].tolist() == [0, 8] and mesh.groups["low"].tolist() == [*range(8)]
     assert mesh.notes == ["the set 'high' is taken, not the instance of this name"]
+
+
+@pytest.mark.parametrize(
+    ("old", "new"), [("1, 0, 0, 0", "1, <left>, 0, 0"), ("1, 0, 0, 0", "<n>, 0, 0, 0")], ids=["coordinate", "number"]
+)
+def test_values_of_parameters_are_refused_as_these(tmp_path, old, new):
+    lines = [new if line == old else line for line in MESH]
+    with pytest.raises(DatasetError, match=r"'<\w+>' is no (whole )?number: it stands for a value of \*PARAMETER"):
+        read(tmp_path, "*PARAMETER", "left = 0", "n = 1", *lines)
