@@ -154,7 +154,8 @@ def _fitting(
     fitting = np.where(2 * thickness > wall, _OF_WALL * wall, thickness)
     part = connected_parts(triangles, len(points))
     for one in np.unique(part[nodes]):
-        own, rows = part[nodes] == one, triangles[part[triangles[:, 0]] == one]
+        own = part[nodes] == one
+        rows = triangles[part[triangles[:, 0]] == one]
         if not is_closed(rows):  # a node beside the tetrahedra meets none, but the layer between two nodes may
             room[own] = min(room[own].min(), _room_behind(points, rows, tetrahedra))
     return np.where(room < wall, np.minimum(fitting, _OF_ROOM * room), fitting)
@@ -169,7 +170,7 @@ def _room_behind(points: np.ndarray, triangles: np.ndarray, tetrahedra: np.ndarr
     others = np.ascontiguousarray(points[np.unique(tetrahedra)])
     squared, nearest, at = igl.point_mesh_squared_distance(others, np.ascontiguousarray(points[used]), faces)
     distance = np.sqrt(squared)
-    height = np.einsum("ni,ni->n", others - at, unit_normals(points[triangles])[nearest])
+    height = np.einsum("ni,ni->n", others - at, unit_normals(points[triangles])[np.asarray(nearest)])
     return float(distance[height < -_BEHIND * distance].min(initial=np.inf))
 
 

@@ -94,9 +94,10 @@ def _check_apart(
         told = f"overlap at rest by {depth:.3g} {spec.unit} at" if depth > 0 else "cut each other at rest near"
         where = where if depth > 0 else nearest_node(rest, *faces)
         slight = 2 * shared.contact_distance  # surfaces that touch were set back by about the half
-        overlap = below_faces(rest, *faces, slight) if 0 < depth < slight else None
+        overlap = below_faces(rest, faces[0], faces[1], slight) if 0 < depth < slight else None
         if overlap is not None:
-            told, where = "stand at the same place, wholly or in part, around", overlap.where
+            told = "stand at the same place, wholly or in part, around"
+            where = overlap.where
         where = where + shared.origin
         raise BadAssembly(
             f"{names} {told} {point(where)}: move one of them by an offset, or mesh curved surfaces that touch finer;"
