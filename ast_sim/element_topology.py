@@ -101,6 +101,13 @@ def unique_edges(elements: np.ndarray, num_nodes: int) -> np.ndarray:
     return kept(np.stack(np.divmod(keys, num_nodes), axis=1).astype(np.int32))
 
 
+def shortest_edge(points: np.ndarray, elements: np.ndarray) -> float:
+    """The length of the shortest edge between two corners; 0 without elements."""
+    corners = points[elements[:, :4]].astype(np.float64)
+    lengths = [np.linalg.norm(corners[:, a] - corners[:, b], axis=1) for a, b in LOCAL_EDGES[corners.shape[1]]]
+    return float(np.min(lengths)) if len(elements) else 0.0
+
+
 def triangle_sides(triangles: np.ndarray) -> np.ndarray:
     """[3 F, 2]: the three edges of each triangle, one triangle after the other, with the smaller node first."""
     return np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ast_sim.element_topology import shortest_edge
 from ast_sim.importers.mesh_file import MeshFile, read_mesh
 from ast_sim.importers.places import Place, parse_places
 from ast_sim.material import Material
@@ -189,7 +190,7 @@ def clamped(mesh: MeshFile, scene: Scene, used: np.ndarray, clamp: str) -> np.nd
     """
     body, places = parse_clamp(clamp, [*mesh.groups, *mesh.source.point_fields])
     nodes = np.flatnonzero(nodes_of_body(scene.body, body))
-    shortest = _shortest_edge(scene, body)
+    shortest = shortest_edge(scene.rest_position, scene.elements[scene.body[scene.elements[:, 0]] == body])
     held = np.zeros(len(nodes), bool)
     for place in places:
         inside = place.inside(mesh.points[used[nodes]], *mesh.masks(used[nodes]), shortest)
@@ -200,13 +201,6 @@ def clamped(mesh: MeshFile, scene: Scene, used: np.ndarray, clamp: str) -> np.nd
             )
         held |= inside
     return nodes[held]
-
-
-def _shortest_edge(scene: Scene, body: int) -> float:
-    ends = scene.elements[scene.body[scene.elements[:, 0]] == body][:, :4]
-    corners = scene.rest_position[ends].astype(np.float64)
-    lengths = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
-    return float(lengths.min(initial=np.inf)) if len(ends) else 0.0
 
 
 def _on_a_line(points: np.ndarray) -> bool:

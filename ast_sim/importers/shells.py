@@ -3,7 +3,7 @@
 A scene has elements of one kind, so a shell becomes a thin layer of tetrahedra: each of its nodes gets a second node
 behind it, half a mesh width along the normal, on the side that looks away from the tetrahedra. The shell itself is the
 front of the layer, so contact takes place where it took place in the file. Where the shell closes a thin wall, the
-layer is a third of the wall; where tetrahedra lie behind an open shell, it takes 1/200 of the way to them.
+layer is a third of the wall; where tetrahedra lie behind an open shell, all of it takes 1/200 of the way to them.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ast_sim.element_topology import LOCAL_FACES, is_closed
+from ast_sim.element_topology import LOCAL_FACES, is_closed, unit_normals
 from ast_sim.number_arrays import connected_parts
 
 # The thickness of the layer, in mean edge lengths.
@@ -24,6 +24,9 @@ _OF_WALL, _OF_ROOM = 1 / 3, 1 / 200
 
 # Where the normal of a node leads out through another triangle at it, the layer has this share of the usual thickness.
 _LEAST = 0.01
+
+# Nodes are behind a shell if the way to them leads backwards by at least this share of it.
+_BEHIND = 0.5
 
 # The front of an open shell is the side that looks at the tetrahedra, in this share of the triangles, the nearest ones.
 _NEAREST = 0.1
@@ -149,7 +152,26 @@ def _fitting(
     faces = tetrahedra[:, np.array(LOCAL_FACES)].reshape(-1, 3)
     room = _distance_along(points, faces, start, inwards)
     fitting = np.where(2 * thickness > wall, _OF_WALL * wall, thickness)
+    part = connected_parts(triangles, len(points))
+    for one in np.unique(part[nodes]):
+        own = part[nodes] == one
+        rows = triangles[part[triangles[:, 0]] == one]
+        if not is_closed(rows):  # a node beside the tetrahedra meets none, but the layer between two nodes may
+            room[own] = min(room[own].min(), _room_behind(points, rows, tetrahedra))
     return np.where(room < wall, np.minimum(fitting, _OF_ROOM * room), fitting)
+
+
+def _room_behind(points: np.ndarray, triangles: np.ndarray, tetrahedra: np.ndarray) -> float:
+    """The distance from the triangles to the nearest node of tetrahedra that is behind them; inf if there is none."""
+    import igl
+
+    used, corners = np.unique(triangles, return_inverse=True)
+    faces = np.ascontiguousarray(corners.reshape(-1, 3), np.int64)
+    others = np.ascontiguousarray(points[np.unique(tetrahedra)])
+    squared, nearest, at = igl.point_mesh_squared_distance(others, np.ascontiguousarray(points[used]), faces)
+    distance = np.sqrt(squared)
+    height = np.einsum("ni,ni->n", others - at, unit_normals(points[triangles])[np.asarray(nearest)])
+    return float(distance[height < -_BEHIND * distance].min(initial=np.inf))
 
 
 def _sticks_out(points: np.ndarray, triangles: np.ndarray, inwards: np.ndarray, nodes: np.ndarray) -> np.ndarray:

@@ -68,6 +68,11 @@ class SolidCase:
         """What load steps follow from the frame before to this one."""
         return [Leg(self.prescribed_position[frame])] if self.course is None else self.course.legs(frame)
 
+    def on_legs(self) -> np.ndarray:
+        """[L,N,3]: where the prescribed nodes are in frame 0 and at the end of each leg."""
+        ends = [leg.end for frame in range(1, len(self.prescribed_position)) for leg in self.legs(frame)]
+        return np.stack([self.prescribed_position[0], *ends])
+
     def straight(self, frame: int) -> list[Leg]:
         """What load steps follow from rest to a frame, past the frames between."""
         return [Leg(self.prescribed_position[frame])] if self.course is None else self.course.straight(frame)

@@ -11,6 +11,7 @@ import numpy as np
 
 from ast_sim.mechanics.case import SolidCase
 from ast_sim.mechanics.contact_and_friction import Contact
+from ast_sim.mechanics.driven import Driven
 from ast_sim.mechanics.elements.neo_hookean import von_mises
 from ast_sim.mechanics.elements.second_order import deforming_body
 from ast_sim.mechanics.frames import MAX_FRAME_ITERATIONS, FrameRecord, Frames, GivenUp
@@ -160,6 +161,7 @@ class SolidFrames(Frames[SolidRecord]):
         contact = Contact(rest, scene.surface(), scene.body, case.contact, ~scene.deforming_nodes)
         solver = QuasiStatic(self._elasticity, contact, scene.prescribed, rest, settings, system)
         super().__init__(case, solver, contact)
+        self.driven = Driven.of(scene, case.on_legs())  # frames may not show how far nodes turn, nor which way
         self._reactions = np.zeros_like(rest)
         self.record_type = SolidRecord if self.driven.axis is None else TurnedRecord
         self._work = 0.0

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ast_sim.element_topology import triangle_sides
+from ast_sim.element_topology import triangle_sides, unit_normals
 from ast_sim.number_arrays import point
 from ast_sim.plausibility.findings import Finding
 from ast_sim.scene import Scene
@@ -21,8 +21,8 @@ _MOST_BODIES = 60
 
 
 class Overlap(NamedTuple):
-    """Two bodies that overlap: how deep a node of one lies in the other (0 if only edges cut faces, infinite if both
-    are one body that stands twice), and where."""
+    """Two bodies that overlap: how deep a node of one lies in the other (0 if only edges cut faces, infinite if one
+    body stands twice, or faces lie on each other with both bodies on one side), and where."""
 
     depth: float
     where: np.ndarray
@@ -50,7 +50,7 @@ def overlaps(scene: Scene) -> list[Finding]:
         if overlap is not None:
             inner, outer = (other, one) if other in rigid or other > one else (one, other)
             told = f"lies {overlap.depth:.3g} inside body {outer}" if overlap.depth else f"cuts body {outer}"
-            told = f"stands where body {outer} stands" if overlap.depth == np.inf else told
+            told = f"stands where body {outer} stands, wholly or in part," if overlap.depth == np.inf else told
             meaning = f"body {inner} {told} at the start; scenes that can be solved have no overlap: move one of them"
             findings.append(Finding("pairs of bodies that overlap", 1, f"at {point(overlap.where)}", meaning))
     return findings
@@ -77,7 +77,7 @@ def deepest(rest: np.ndarray, first: np.ndarray, second: np.ndarray, tolerated: 
     if depth > tolerated:
         return Overlap(depth, where)
     cut = _cut(rest, first, second, tolerated)
-    return None if cut is None else Overlap(0.0, cut)
+    return below_faces(rest, first, second, tolerated) if cut is None else Overlap(0.0, cut)
 
 
 def deepest_node(rest: np.ndarray, first: np.ndarray, second: np.ndarray) -> tuple[float, np.ndarray]:
@@ -95,17 +95,37 @@ def deepest_node(rest: np.ndarray, first: np.ndarray, second: np.ndarray) -> tup
 def nodes_inside(rest: np.ndarray, mine: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The nodes of one surface [F, 3] that lie inside another, closed one: their numbers [n], how deep each lies [n],
     and the row [n] of the triangle of the other that is nearest."""
-    import igl  # takes 0.2 s
-
     used, faces = np.unique(other, return_inverse=True)
     nodes = np.unique(mine)
-    low, high = rest[used].min(axis=0), rest[used].max(axis=0)
-    nodes = nodes[((rest[nodes] > low) & (rest[nodes] < high)).all(axis=1)]
-    if not len(nodes):
-        return nodes, np.empty(0), nodes
-    distance, nearest = igl.signed_distance(rest[nodes], rest[used], faces.reshape(-1, 3))[:2]
+    rows, depths, nearest = _inside(rest[nodes], rest[used], faces.reshape(-1, 3))
+    return nodes[rows], depths, nearest
+
+
+def _inside(points: np.ndarray, corners: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The rows [n] of the points that lie inside a closed surface [F, 3] between corners, how deep each lies, and the
+    row of the triangle that is nearest."""
+    import igl  # takes 0.2 s
+
+    rows = np.flatnonzero(((points > corners.min(axis=0)) & (points < corners.max(axis=0))).all(axis=1))
+    if not len(rows):
+        return rows, np.empty(0), rows
+    distance, nearest = igl.signed_distance(points[rows], corners, faces)[:2]
     inside = np.flatnonzero(np.asarray(distance) < 0)
-    return nodes[inside], -np.asarray(distance)[inside], np.asarray(nearest)[inside]
+    return rows[inside], -np.asarray(distance)[inside], np.asarray(nearest)[inside]
+
+
+def below_faces(rest: np.ndarray, first: np.ndarray, second: np.ndarray, tolerated: float) -> Overlap | None:
+    """Where a point just below the middle of a face of one surface lies in the other: of bodies whose faces lie on each
+    other, as where one stands twice in two meshes, no node lies inside and no edge cuts."""
+    for mine, other in ((first, second), (second, first)):
+        points = rest[mine].mean(axis=1) - 2 * tolerated * unit_normals(rest[mine])
+        for faces in (other, mine):  # below a face of a thin wall there may be nothing of it
+            used, numbers = np.unique(faces, return_inverse=True)
+            rows, depths, _ = _inside(points, rest[used], numbers.reshape(-1, 3))
+            points = points[rows[depths > tolerated]]
+        if len(points):
+            return Overlap(np.inf, points.mean(axis=0))
+    return None
 
 
 def _cut(rest: np.ndarray, first: np.ndarray, second: np.ndarray, tolerated: float) -> np.ndarray | None:

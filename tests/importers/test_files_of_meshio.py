@@ -110,10 +110,11 @@ def nastran(folder, text):
     [
         (f"{WHOLE}CHEX20  {7:8}{1:8}\n", "CHEX20 elements"),
         (f"{WHOLE}CQUADX,7,1,1,2,3,4\n", "CQUADX elements"),
+        (f"{WHOLE}GRID,1,,0.,0.,-1.\n", "GRID 1 stands twice, with different fields"),
     ],
 )
 def test_cards_of_nastran_that_meshio_reads_over_are_refused(tmp_path, text, cause):
-    with pytest.raises(DatasetError, match=f"a.bdf: holds an? ?{cause}|a.bdf: holds {cause}"):
+    with pytest.raises(DatasetError, match=f"a.bdf: (holds )?{cause}"):
         nastran(tmp_path, text)
 
 

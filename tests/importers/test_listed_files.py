@@ -7,6 +7,7 @@ import meshio
 import pytest
 import pyvista
 from blocks import block
+from vtkmodules.vtkIOHDF import vtkHDFWriter
 
 from ast_sim.importers.series import FieldNames, read_series
 from ast_sim.support.errors import DatasetError
@@ -144,3 +145,22 @@ def test_times_in_a_folder_that_are_not_used_are_told(folder, tmp_path_factory):
     assert notes(files) == "f_1.vtu and f_3.vtu say the same time 0.1: the times inside are not used"
     shutil.copy(folder / "a_3.vtu", files / "f_3.vtu")
     assert notes(files) == "f_3.vtu says no time, other files do: the times inside are not used"
+
+
+def test_vtkhdf_files_of_one_frame_each_may_be_listed(tmp_path):
+    """As ParaView writes a series of them."""
+    entries = []
+    for frame in range(3):
+        points = CUBE.rest_position * (1, 1, 1 - 0.1 * frame)
+        grid = pyvista.from_meshio(meshio.Mesh(points, [("tetra", CUBE.elements)]))
+        writer = vtkHDFWriter()
+        writer.SetFileName(str(tmp_path / f"a_{frame}.vtkhdf"))
+        writer.SetInputData(grid)
+        writer.Write()
+        entries.append((0.5 * frame, "", f"a_{frame}.vtkhdf"))
+    series = [{"name": name, "time": time} for time, _, name in entries]
+    (tmp_path / "a.vtkhdf.series").write_text(json.dumps({"file-series-version": "1.0", "files": series}))
+    for source in (pvd(tmp_path, entries), tmp_path / "a.vtkhdf.series"):
+        read = read_series(source, NAMES)
+        assert read.times == (0.0, 0.5, 1.0)
+        assert read.position[:, :, 2].max(axis=1) == pytest.approx([1, 0.9, 0.8])

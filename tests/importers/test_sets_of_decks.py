@@ -85,3 +85,31 @@ def test_a_section_of_a_body_of_revolution_is_told(tmp_path, kind, told):
     mesh = read(tmp_path, "*NODE", "1, 1, 0", "2, 2, 0", "3, 1, 1", f"*ELEMENT, TYPE={kind}", "1, 1, 2, 3")
     assert np.array_equal(mesh.elements, [[0, 1, 2]])
     assert ("1 element is a section of a body of revolution: taken as a plane" in mesh.notes) == told
+
+
+@pytest.mark.parametrize(
+    ("lines", "nodes", "told"),
+    [
+        (["*NSET, NSET=one", "8"], [7], ["the set 'one' of nodes is taken, not the one of elements"]),
+        (["*NSET, NSET=one, ELSET=one"], OF_FIRST, []),
+    ],
+    ids=["others", "the same"],
+)
+def test_of_two_sets_of_one_name_the_nodes_are_taken_with_a_note(tmp_path, lines, nodes, told):
+    mesh = read(tmp_path, *MESH, *lines)
+    assert mesh.groups["one"].tolist() == nodes and mesh.notes == told
+
+
+def test_a_set_with_the_name_of_an_instance_is_taken_with_a_note(tmp_path):
+    mesh = read(tmp_path, *PARTS, "*NSET, NSET=high", "low.1, high.1", "*END ASSEMBLY")
+    assert mesh.groups["high"].tolist() == [0, 8] and mesh.groups["low"].tolist() == [*range(8)]
+    assert mesh.notes == ["the set 'high' is taken, not the instance of this name"]
+
+
+@pytest.mark.parametrize(
+    ("old", "new"), [("1, 0, 0, 0", "1, <left>, 0, 0"), ("1, 0, 0, 0", "<n>, 0, 0, 0")], ids=["coordinate", "number"]
+)
+def test_values_of_parameters_are_refused_as_these(tmp_path, old, new):
+    lines = [new if line == old else line for line in MESH]
+    with pytest.raises(DatasetError, match=r"'<\w+>' is no (whole )?number: it stands for a value of \*PARAMETER"):
+        read(tmp_path, "*PARAMETER", "left = 0", "n = 1", *lines)

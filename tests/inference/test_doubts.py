@@ -124,7 +124,7 @@ def test_bodies_that_overlap_at_rest_are_told_as_of_files(held):
     assert [f"scene: {line}" for line in path.warnings] == told_of
     twice = ast_sim.Scene.join(scene, scene)
     lines = told(twice, np.concatenate([motion, motion], axis=1))[1]
-    assert any("body 2 stands where body 0 stands at the start; scenes that" in line for line in lines)
+    assert any("body 2 stands where body 0 stands, wholly or in part, at the start; scenes" in line for line in lines)
 
 
 def test_overlaps_are_looked_for_once_in_a_scene(held, monkeypatch):

@@ -104,6 +104,7 @@ class _Assembly:
             if any(one.name == "RESTART" and "READ" in one.options for one in self.deck.keywords):
                 held += ", and continues another job (*RESTART, READ), whose deck has the mesh"
             raise DatasetError(f"{self.deck.path}: holds {held}: a scene needs elements of a volume")
+        groups = self._groups()
         notes = [*self.notes]
         for name, count in self.deck.left_out.items():
             kind = f"of the type {name}"
@@ -122,7 +123,7 @@ class _Assembly:
             notes.append(f"ignored keywords: {', '.join(sorted(ignored))}")
         points = np.concatenate([scope.points for scope in self.scopes.values()])
         numbers = self.scopes[""].numbers if len(self.scopes) == 1 else np.arange(len(points))
-        return SourceMesh(self.deck.path, points, self.blocks, groups=self._groups(), notes=notes, same_point=numbers)
+        return SourceMesh(self.deck.path, points, self.blocks, groups=groups, notes=notes, same_point=numbers)
 
     def _take_elements(self, name: str, scope: _Scope) -> None:
         numbers, nodes = [np.zeros(0, np.int64)], []
@@ -201,7 +202,9 @@ class _Assembly:
                 groups |= {self.deck.written[key]: nodes for key, nodes in of_scope.items()}
                 continue
             shown = self.deck.written[name]
-            groups[shown] = scope.start + np.arange(len(scope.numbers))
+            everyone = scope.start + np.arange(len(scope.numbers))
+            if not np.array_equal(groups.setdefault(shown, everyone), everyone):
+                self.notes.append(f"the set {shown!r} is taken, not the instance of this name")
             groups |= {f"{shown}.{self.deck.written[key]}": nodes for key, nodes in of_scope.items()}
             for key, nodes in of_scope.items():
                 short.setdefault(self.deck.written[key], []).append(nodes)

@@ -30,14 +30,19 @@ def real(text: str, line: Line) -> float:
         return 0.0
     bare = _FORTRAN.sub(r"\1e\2", text)
     if not _NUMBER.fullmatch(bare):
-        raise DatasetError(f"{line.place}: {text!r} is no number")
+        raise DatasetError(f"{line.place}: {text!r} is no number{_of_parameter(text)}")
     return float(bare.lower().replace("d", "e"))
 
 
 def whole(text: str, line: Line) -> int:
     if not re.fullmatch(r"[-+]?[0-9]{1,18}", text):
-        raise DatasetError(f"{line.place}: {text!r} is no whole number")
+        raise DatasetError(f"{line.place}: {text!r} is no whole number{_of_parameter(text)}")
     return int(text)
+
+
+def _of_parameter(text: str) -> str:
+    """What to do about `<width>`, which stands for a number that *PARAMETER of Abaqus gives."""
+    return ": it stands for a value of *PARAMETER; write the number itself" if re.search("<.*>", text) else ""
 
 
 def refuse_decimal_commas(line: Line, most: int, what: str) -> None:

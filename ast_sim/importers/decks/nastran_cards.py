@@ -46,14 +46,22 @@ def plain_nastran(path: Path) -> bytes:
     """A deck of Nastran with the points and elements of a deck, and of the files that it includes, alone.
 
     Raises:
-        DatasetError: it holds elements that are not known, or lacks something; the text names the file and the line.
+        DatasetError: it holds elements that are not known, lacks something, or has two points of one number; the text
+            names the file and the line.
     """
     points = NastranPoints(path)
     cells: list[str] = []
+    places: dict[str, tuple[list[str], str]] = {}
     for place, (card, *fields) in _cards_of_nastran(path):
         name = card.rstrip("_")
         if name.startswith("C") and name not in _ELEMENTS and not _NO_ELEMENTS.match(name):
             raise DatasetError(f"{path}: holds {name} elements, which are not read ({place}): {INSTEAD}")
+        if name == "GRID":
+            before, where = places.setdefault(fields[0], (fields[1:5], place))
+            if before != fields[1:5]:
+                raise DatasetError(
+                    f"{path}: GRID {fields[0]} stands twice, with different fields ({where} and {place}): leave one out"
+                )
         if name in ("GRID", "GRDSET") or re.fullmatch("CORD[12][RCS]", name):
             points.take(place, name, fields)
         elif name in _ELEMENTS:

@@ -120,6 +120,8 @@ def _scanned(path: Path) -> Declared:
                     raise ValueError(f"a piece has {min(counts)} points or cells")
                 declared.pieces.append((counts[0], sum(counts[1:])))
         elif tag == "DataArray":
+            if place in ("PointData", "CellData") and not attributes.get("Name"):
+                raise ValueError(f"an array of its {place} has no name: name it, or leave it out")
             declared.arrays.append(Array(attributes.get("Name", place), place, attributes, len(declared.pieces) - 1))
         elif tag == "AppendedData":
             declared.appended = attributes.get("encoding", "raw")

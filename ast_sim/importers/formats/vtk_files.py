@@ -9,11 +9,9 @@ import atexit
 import contextlib
 import json
 import os
-import re
 import signal
 import subprocess
 import sys
-import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -32,6 +30,7 @@ from ast_sim.importers.formats.declared_sizes import (
 from ast_sim.importers.formats.dyna_files import require_whole, with_nodes
 from ast_sim.importers.formats.frd_given_up import is_left_out
 from ast_sim.importers.formats.frd_results import read_frd_headers
+from ast_sim.importers.formats.pieces_apart import are_unlike, copy_of, read_apart, with_pieces_only
 from ast_sim.importers.formats.source_mesh import SourceMesh
 from ast_sim.importers.formats.together import labels_of, together
 from ast_sim.importers.formats.vtk_cells import blocks_of
@@ -71,15 +70,17 @@ def vtk_frames(path: Path) -> Iterator[SourceMesh]:
         DatasetError: VTK refuses the file, crashes on it, or makes something else of it than the file says it holds.
         MissingExtra: VTK is not installed.
     """
-    pieces, budget = _checked(path)
+    pieces, budget, apart = _checked(path)
     if path.suffix.lower() == ".vtk" and _ends_in_a_number(path):
-        with _copy(path, path.read_bytes() + b"\n") as copy:
+        with copy_of(path, path.read_bytes() + b"\n") as copy:
             told = "the file ends without a line end: is its last number cut off?"
             yield from (replace(frame, path=path, notes=[*frame.notes, told]) for frame in vtk_frames(copy))
         return
-    if pieces and pieces[0] == (0, 0) and any(pieces[1:]) and path.suffix.lower() == ".vtu":
-        with _copy(path, _without_empty_pieces(path)) as copy:
-            yield from (replace(frame, path=path) for frame in vtk_frames(copy))
+    if apart:
+        with contextlib.ExitStack() as stack:
+            copies = [stack.enter_context(copy_of(path, with_pieces_only(path, kept))) for kept in apart]
+            for parts in zip(*map(vtk_frames, copies), strict=True):
+                yield replace(together(parts), path=path, piece_names=())
         return
     of_steps = declared_in_vtkhdf(path) if path.suffix.lower() == ".vtkhdf" else []
     step, steps = 0, 1
@@ -106,24 +107,6 @@ def _ends_in_a_number(path: Path) -> bool:
     content = path.read_bytes()
     lines = content[:512].split(b"\n")
     return len(lines) > 2 and lines[2].strip().upper() == b"ASCII" and not content[-1:].isspace()
-
-
-@contextlib.contextmanager
-def _copy(path: Path, content: bytes) -> Iterator[Path]:
-    """A file of the same name with other content."""
-    with tempfile.TemporaryDirectory() as folder:
-        copy = Path(folder) / path.name
-        copy.write_bytes(content)
-        yield copy
-
-
-def _without_empty_pieces(path: Path) -> bytes:
-    """A file without its pieces that have no points: VTK takes the names of all arrays from the first."""
-    head, mark, data = path.read_bytes().partition(b"<AppendedData")
-    for piece in re.findall(rb"<Piece\b[^>]*/>|<Piece\b.*?</Piece>", head, re.DOTALL):
-        if re.match(rb"<Piece\b[^>]*\bNumberOfPoints\s*=\s*[\"']\s*0+\s*[\"']", piece):
-            head = head.replace(piece, b"", 1)
-    return head + mark + data
 
 
 def _require_counts(mesh: SourceMesh, declared: list[int] | None) -> None:
@@ -157,26 +140,28 @@ def _require_no_deleted(mesh: SourceMesh) -> None:
         )
 
 
-def _checked(path: Path) -> tuple[list[tuple[int, int]], int]:
-    """The points and cells of each piece, if the file says them, and the bytes of memory that VTK may take."""
+def _checked(path: Path) -> tuple[list[tuple[int, int]], int, list[list[int]]]:
+    """The points and cells of each piece, if the file says them, the bytes of memory that VTK may take, and which
+    pieces are to be read apart."""
     ending = path.suffix.lower()
     size = path.stat().st_size
     if ending in EXODUS:
         require_whole_exodus(path)
     if ending in (".vtu", ".vtp", ".vts"):
         declared = declared_in_xml(path)
-        return declared.pieces if ending != ".vts" else [], _OWN_BYTES + _COPIES * (needed_bytes(declared) + size)
+        budget = _OWN_BYTES + _COPIES * (needed_bytes(declared) + size)
+        return (declared.pieces, budget, read_apart(declared)) if ending != ".vts" else ([], budget, [])
     if ending in (".pvtu", ".pvtp", ".pvts", *BLOCKS):
-        return _of_pieces(path)
+        return *_of_pieces(path), []
     if ending == ".vtkhdf" or (ending in EXODUS and _is_hdf(path)):
-        return [], _OWN_BYTES + _COPIES * stored_in_hdf(path, "VTKHDF" if ending == ".vtkhdf" else "/")
+        return [], _OWN_BYTES + _COPIES * stored_in_hdf(path, "VTKHDF" if ending == ".vtkhdf" else "/"), []
     if ending == ".frd":
         (nodes, elements), _ = read_frd_headers(path)
-        return [(nodes, elements)], _OWN_BYTES + _LARGEST_RATIO * size
+        return [(nodes, elements)], _OWN_BYTES + _LARGEST_RATIO * size, []
     if is_dyna(path):
         require_whole(path)
         size = sum(part.stat().st_size for part in path.parent.glob(f"{path.name}*"))
-    return [], _OWN_BYTES + _LARGEST_RATIO * size
+    return [], _OWN_BYTES + _LARGEST_RATIO * size, []
 
 
 def _of_pieces(path: Path) -> tuple[list[tuple[int, int]], int]:
@@ -192,6 +177,11 @@ def _of_pieces(path: Path) -> tuple[list[tuple[int, int]], int]:
             raise DatasetError(f"{path}: lists {name}, which does not exist")
         if file.suffix.lower() in (".vtu", ".vtp", ".vts"):
             declared = declared_in_xml(file)
+            if are_unlike(declared):
+                raise DatasetError(
+                    f"{file}: its pieces have different fields, or the same in another order, and VTK mixes them up:"
+                    " write each piece into a file of its own"
+                )
             pieces += declared.pieces
             budget += _COPIES * (needed_bytes(declared) + file.stat().st_size)
     return (pieces if path.suffix.lower() == ".pvtu" else []), budget

@@ -116,7 +116,7 @@ def _listed(source: Path, name: str) -> Path:
     file = source.parent / name
     if not file.is_file() and "\\" in name:
         file = source.parent / name.replace("\\", "/")
-    if file.suffix.lower() not in ONE_FRAME:
+    if file.suffix.lower() not in (*ONE_FRAME, ".vtkhdf"):
         raise DatasetError(f"{source}: lists {name}, which is no .vtu file nor another file of a frame")
     if not file.is_file():
         raise DatasetError(f"{source}: lists {source.parent / name}, which does not exist")

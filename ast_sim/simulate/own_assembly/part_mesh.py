@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ast_sim.dataset.layout import LENGTH_UNITS
-from ast_sim.element_topology import MIDDLES, linear_elements
+from ast_sim.element_topology import MIDDLES, linear_elements, shortest_edge
 from ast_sim.importers.formats.stl_file import BadSurface
 from ast_sim.importers.mesh_file import read_mesh
 from ast_sim.importers.places import Place, marked
@@ -67,17 +67,20 @@ class PartMesh:
             ConfigError: a place holds no node, or there is no such field or group; the text begins with `key`.
         """
         nodes = np.zeros(len(self.position), bool)
+        shortest = shortest_edge(self.position, self.cells)
         for place in places:
-            inside = place.inside(self.position, lambda name: marked(self._known("field", name, key)), self._group(key))
+            inside = place.inside(
+                self.position,
+                lambda name: marked(self._known("field", name, key)),
+                lambda name: np.isin(np.arange(len(self.position)), self._known("group", name, key)),
+                shortest,
+            )
             if not inside.any():
                 ends = zip("xyz", self.position.min(axis=0), self.position.max(axis=0), strict=True)
                 box = ", ".join(f"{axis} from {low:.6g} to {high:.6g}" for axis, low, high in ends)
                 raise ConfigError(f"{key}: no node of {self.name} lies in {place.text!r}; it reaches in {box}")
             nodes |= inside
         return nodes
-
-    def _group(self, key: str) -> Any:
-        return lambda name: np.isin(np.arange(len(self.position)), self._known("group", name, key))
 
     def _known(self, kind: str, name: str, key: str) -> np.ndarray:
         known = self.fields if kind == "field" else self.groups

@@ -13,7 +13,7 @@ from ast_sim.mechanics.case import SolidCase
 from ast_sim.mechanics.contact_and_friction import Contact, ContactSettings
 from ast_sim.mechanics.linearised.contact_forces import presses_itself_at_rest
 from ast_sim.number_arrays import point
-from ast_sim.plausibility.overlaps import deepest_node
+from ast_sim.plausibility.overlaps import below_faces, deepest_node
 from ast_sim.simulate.own_assembly.assembly_spec import AssemblySpec
 from ast_sim.simulate.own_assembly.standing import Reference
 from ast_sim.simulate.shapes.parts import quarters
@@ -92,7 +92,13 @@ def _check_apart(
     crossing = contact.intersects(rest)
     if crossing or depth > 0:
         told = f"overlap at rest by {depth:.3g} {spec.unit} at" if depth > 0 else "cut each other at rest near"
-        where = (where if depth > 0 else nearest_node(rest, *faces)) + shared.origin
+        where = where if depth > 0 else nearest_node(rest, *faces)
+        slight = 2 * shared.contact_distance  # surfaces that touch were set back by about the half
+        overlap = below_faces(rest, faces[0], faces[1], slight) if 0 < depth < slight else None
+        if overlap is not None:
+            told = "stand at the same place, wholly or in part, around"
+            where = overlap.where
+        where = where + shared.origin
         raise BadAssembly(
             f"{names} {told} {point(where)}: move one of them by an offset, or mesh curved surfaces that touch finer;"
             " the parts of a press fit begin apart, and a move presses them together"

@@ -50,6 +50,8 @@ def test_a_turn_between_two_frames_is_the_turn_that_was_asked_for(degrees, tmp_p
     assert turned.attributes["elastic_energy"][-1] == pytest.approx(quarter * (degrees / 90) ** 2, rel=0.2)
     in_steps = solved(tmp_path, TURNED.format(frames=1 + abs(degrees) // 30, degrees=degrees))
     np.testing.assert_array_equal(turned.position[-1], in_steps.position[-1])
+    torque = in_steps.attributes["torque"][-1]
+    assert turned.attributes["torque"][-1] == pytest.approx(torque, rel=1e-6) and torque > 0
 
 
 def test_a_path_that_comes_back_between_frames_is_followed(tmp_path):

@@ -3,10 +3,11 @@
 import meshio
 import numpy as np
 import pytest
-from simulate.own_assembly.assemblies import box, write_assembly
+from simulate.own_assembly.assemblies import SPEC, box, case_of, write_assembly
 
 from ast_sim import Dataset, cli
 from ast_sim.element_topology import surface_triangles
+from ast_sim.scene import NodeType
 from ast_sim.simulate.own_assembly.parameters import completed
 from ast_sim.simulate.own_assembly.part_mesh import part_meshes
 from ast_sim.simulate.own_assembly.spec_reader import read_spec
@@ -43,6 +44,19 @@ def test_the_notes_of_a_mesh_are_the_notes_of_its_part(tmp_path, kind):
     (note,) = block.notes
     assert note.startswith(BLOCK) and told in note
     assert not punch.notes
+
+
+@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize("noise", [0, 1e-5, 1e-3, 0.01])
+def test_an_end_that_is_flat_to_five_digits_is_held_as_a_whole(tmp_path, noise, order):
+    """As after a conversion that rounds; the shortest edge is 2.5 mm."""
+    path = write_assembly(tmp_path, SPEC.replace("order = 1", f"order = {order}"))
+    position, elements = box((0, 0, 0), (10, 10, 5), (4, 4, 2))
+    position += np.random.default_rng(0).uniform(-noise, noise, position.shape)
+    meshio.Mesh(position, [("tetra", elements)]).write(tmp_path / "block.vtu")
+    scene = case_of(path).scene
+    corners = np.unique(scene.elements[scene.body[scene.elements[:, 0]] == 0][:, :4])
+    assert (scene.node_type[corners] == NodeType.HANDLE).sum() == 25
 
 
 def test_generate_tells_them_and_keeps_them_with_the_scenes(tmp_path, capsys):

@@ -109,6 +109,17 @@ def test_a_sheet_between_two_parts_leaves_the_gap_behind_it(tmp_path):
     assert gap_between(case, (1, 2)) == pytest.approx(0.5, rel=1e-3)
 
 
+@pytest.mark.parametrize(("half", "cells"), [(14, 5), (14, 2), (40, 1)])
+def test_a_sheet_that_is_wider_than_the_parts_leaves_the_gap_behind_it(tmp_path, half, cells):
+    """Its outer nodes, or all of them, have nothing behind them; the layer between them would cut the lid."""
+    points, triangles = prism(np.array([[-half, 8], [half, 8], [half, 9], [-half, 9]], float), -half, half, cells)
+    flat = triangles[(points[triangles][:, :, 2] == 8).all(axis=1)]
+    write_box(tmp_path / "lid.vtu", (-12, -12, 8.5), (12, 12, 18), (4, 4, 2))
+    case = case_of(write(tmp_path, (points, flat), SPEC.replace("-8.5", "-0.1") + SECOND))
+    gaps = [gap_between(case, pair) for pair in ((0, 1), (1, 2))]
+    assert sorted(gaps) == pytest.approx([0.5, 8], abs=0.045) and gaps[0] > 7
+
+
 def test_a_closed_die_around_a_body_has_its_layer_outside(tmp_path):
     """A closed surface around the body it presses: the layer looks away from the body."""
     from ast_sim.simulate.shapes.parts import rectilinear
