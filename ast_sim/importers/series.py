@@ -201,7 +201,7 @@ def _read_frames(
             notes.append(
                 f"the elements of {frame.path.name} stand in another order: they are reordered as in the first"
             )
-        stitching.look(frame, used_fields)
+        stitching.look(frame, used_fields, names.displacement or "displacement")
         constant.look(frame, cells)
         kept.times.append(frame.time)
         kept.points.append(frame.points)

@@ -15,7 +15,9 @@ def test_random_files_of_many_programs_are_read_right_or_refused(tmp_path):
     result = measure(DRAWS, 0, tmp_path)
     assert result["bad"] == []
     assert set(result["by dialect"]) == set(DIALECTS)
-    assert result["outcomes"]["right"] >= DRAWS - 3, result["refusals"]
+    # One of these draws is a legacy file on which VTK crashes; nothing else is refused.
+    others = [text for text in result["refusals"] if "VTK crashed on it" not in text]
+    assert result["outcomes"]["right"] >= DRAWS - 1 and others == []
 
 
 def moved(simulation):

@@ -185,6 +185,34 @@ def test_offsets_of_vtkhdf_that_mix_steps_are_refused(tmp_path):
             read_series(path, NAMES)
 
 
+@pytest.mark.parametrize("ending", ["vtu", "pvtu"])
+def test_ghost_cells_are_left_out(tmp_path, ending):
+    """Each of two cubes has cells of the other one as ghosts, as programs with several processes write them."""
+    names = []
+    for piece in range(2):
+        points = np.concatenate([CUBE.rest_position + (piece, 0, 0), CUBE.rest_position + (1 - piece, 0, 0)])
+        both = np.concatenate([CUBE.elements, CUBE.elements[:2] + 8])
+        part = pyvista.from_meshio(meshio.Mesh(points, [("tetra", both)]))
+        part.cell_data["vtkGhostType"] = np.array([0] * len(CUBE.elements) + [1, 1], np.uint8)
+        names.append(f"piece_{piece}.vtu")
+        part.save(tmp_path / names[-1])
+    path = tmp_path / names[0]
+    if ending == "pvtu":
+        path = tmp_path / "all.pvtu"
+        points = '<PPoints><PDataArray type="Float64" NumberOfComponents="3"/></PPoints>'
+        ghosts = '<PCellData><PDataArray type="UInt8" Name="vtkGhostType"/></PCellData>'
+        sources = "".join(f'<Piece Source="{name}"/>' for name in names)
+        inner = f'<PUnstructuredGrid GhostLevel="1">{points}{ghosts}{sources}</PUnstructuredGrid>'
+        path.write_text(f'<VTKFile type="PUnstructuredGrid" version="0.1">{inner}</VTKFile>')
+    mesh = read_mesh(path)
+    count = len(names) if ending == "pvtu" else 1
+    assert len(mesh.elements) == count * len(CUBE.elements)
+    x = mesh.points[mesh.elements]
+    volume = np.abs(np.linalg.det(x[:, 1:] - x[:, :1])).sum() / 6
+    assert volume == pytest.approx(count)
+    assert f"{2 * count} ghost cells are left out" in mesh.notes
+
+
 def legacy(path, lost):
     """A legacy file as text with the displacement u, without its last letters."""
     rows = ["".join(f"{x:6.3f}" for x in row) for row in CUBE.rest_position]

@@ -4,11 +4,13 @@ import json
 import shutil
 
 import meshio
+import numpy as np
 import pytest
 import pyvista
 from blocks import block
 from vtkmodules.vtkIOHDF import vtkHDFWriter
 
+from ast_sim.importers.convert import find_series
 from ast_sim.importers.series import FieldNames, read_series
 from ast_sim.support.errors import DatasetError
 
@@ -164,3 +166,23 @@ def test_vtkhdf_files_of_one_frame_each_may_be_listed(tmp_path):
         read = read_series(source, NAMES)
         assert read.times == (0.0, 0.5, 1.0)
         assert read.position[:, :, 2].max(axis=1) == pytest.approx([1, 0.9, 0.8])
+
+
+def test_a_list_that_is_written_on_windows_names_files_in_folders(folder):
+    """With backslashes; the other folder holds other results."""
+    source = pvd(folder, [(time, "", f"sub\\{name}") for time, _, name in A])
+    pressed_less = [1, 0.95, 0.9, 0.85]
+    np.testing.assert_allclose(read_series(source, NAMES).position[:, :, 2].max(axis=1), pressed_less, rtol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["list", "folder", "one of several"])
+def test_endings_have_no_case(folder, tmp_path_factory, kind):
+    files = tmp_path_factory.mktemp("files")
+    for frame in range(4):
+        shutil.copy(folder / f"a_{frame}.vtu", files / f"A_{frame}.VTU")
+    source = files
+    if kind != "folder":
+        source = pvd(files, [(time, "", name.upper()) for time, _, name in A]).rename(files / "ALL.PVD")
+    source = find_series(files)["ALL"] if kind == "one of several" else source
+    read = read_series(source, NAMES)
+    np.testing.assert_allclose(read.position[:, :, 2].max(axis=1), (1, 0.9, 0.8, 0.7), rtol=1e-6)

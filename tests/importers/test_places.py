@@ -60,3 +60,19 @@ def test_a_box_and_a_group_of_a_mesh_file(tmp_path):
         read_scene(tmp_path / "a.inp", obstacles=[1], clamps=["0:group=right"])
     with pytest.raises(ConfigError, match="no node of body 0 lies in 'x>9 and zmin'"):
         read_scene(tmp_path / "a.inp", obstacles=[1], clamps=["0:x>9 and zmin"])
+
+
+def test_an_end_is_flat_to_a_hundredth_of_the_shortest_edge(tmp_path):
+    """Coordinates that were written with few digits. The noise differs from node to node, so one node alone is the
+    lowest; nodes that stand in by more are not at the end."""
+    mesh = plate_and_punch()
+    lowest = np.flatnonzero(mesh.points[:, 0] == mesh.points[:, 0].min())
+    ends = mesh.points[mesh.cells[0].data]
+    shortest = np.linalg.norm(ends - np.roll(ends, 1, axis=1), axis=2).min()
+    for share, at_end in ((0.005, len(lowest)), (0.05, 1)):
+        noisy = mesh.points.copy()
+        noisy[lowest, 0] += share * shortest * (np.arange(len(lowest)) > 0)
+        meshio.Mesh(noisy, mesh.cells).write(tmp_path / "a.vtu")
+        scene = read_scene(tmp_path / "a.vtu", obstacles=[1], clamps=["0:xmin"]).scene
+        held = np.flatnonzero(scene.node_type == NodeType.HANDLE)
+        assert np.array_equal(held, lowest[:at_end])

@@ -3,7 +3,8 @@
 Points at one place are joined if the file says that they are one point, or if the mesh is cut all over (no two elements
 share a point), or where whole faces of two separate parts lie on each other and the parts are pieces of the file or
 patches, or stay together in all frames. The fields of points that are joined must agree in every frame: bodies that
-touch and then part have points of their own, and keep them.
+touch and then part have points of their own, and keep them. Elements of a few, and elements that come apart, are bodies
+if the file numbers their points: then two numbers are two points.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ _SAME_PLACE = 1e-6
 # Fields agree if they differ by less than this share of their largest value.
 _SAME_VALUE = 1e-5
 
-# Separate parts, at least this many, that all hold the same number of elements are patches of one mesh.
+# Separate parts, at least this many, that all hold the same number of elements are patches of one mesh, and a mesh of
+# fewer elements is not cut all over if its points have numbers.
 _PATCHES = 4
 
 # Names of fields that number points or processes: they differ at a point that stands several times.
@@ -39,6 +41,7 @@ class Stitching:
         self.blocks = [block for block in mesh.blocks if block.dimension >= 2]
         self.frames = 0
         self.moved = False
+        self.apart = False
         self.pairs = np.zeros((0, 2), np.int64)
         self.disagree: dict[str, np.ndarray] = {}
         self.reason = self._candidates()
@@ -61,7 +64,8 @@ class Stitching:
         count = np.zeros(len(points), np.int64)
         for block in self.blocks:
             count += np.bincount(block.nodes.ravel(), minlength=len(points))
-        if mesh.same_point is not None and count.max() > 1:  # the file numbers its points, so two numbers are two
+        few = sum(len(block.nodes) for block in self.blocks) < _PATCHES
+        if mesh.same_point is not None and (count.max() > 1 or few):  # two numbers are two points
             return ""
         pairs = KDTree(points[used]).query_pairs(self.tolerance, output_type="ndarray")
         if not len(pairs):
@@ -103,10 +107,11 @@ class Stitching:
         elements = elements[elements > 0]
         return "patches" if len(elements) >= _PATCHES and np.ptp(elements) == 0 else "parts"
 
-    def look(self, mesh: SourceMesh, used_fields: tuple[str, ...] = ()) -> None:
+    def look(self, mesh: SourceMesh, used_fields: tuple[str, ...] = (), displacement: str = "displacement") -> None:
         """Compare the points and the fields of a frame at the pairs.
 
         Args:
+            displacement: the field in which points that have numbers of their own come apart.
             used_fields: fields that say what a point is, such as its body: they count even if they look like numbers
                 of points, and cell fields among them count as well.
         """
@@ -116,6 +121,7 @@ class Stitching:
         one, other = self.pairs.T
         apart = np.linalg.norm(mesh.points[one] - mesh.points[other], axis=1) > self.tolerance
         self._differ("the place", apart)
+        self.apart = self.apart or bool(apart.any())
         self.moved = self.moved or not np.array_equal(mesh.points, self.mesh.points)
         for name, values in mesh.point_fields.items():
             if values.dtype.kind not in "iufb" or (_numbers(name, values) and name not in used_fields):
@@ -126,6 +132,7 @@ class Stitching:
             same = (np.abs(a - b) <= _SAME_VALUE * largest) | (np.isnan(a) & np.isnan(b)) | (a == b)
             self.moved = self.moved or (values.shape[1] == 3 and bool(largest))
             self._differ(f"the field {name!r}", ~same.all(axis=1))
+            self.apart = self.apart or (name == displacement and not same.all())
         for name in filter(mesh.cell_fields.__contains__, used_fields):
             lowest, highest = _ends_at_points(mesh, name)
             self._differ(f"the field {name!r}", (lowest[one] != lowest[other]) | (highest[one] != highest[other]))
@@ -148,8 +155,12 @@ class Stitching:
             return np.arange(size), []
         kept = self.pairs[self.agree] if self.reason in ("cut", "ids") else self._whole_parts()
         label = _joined(kept, size)
-        if self.reason == "cut":
-            self._require_joined(label)
+        alone = self._alone(label) if self.reason == "cut" else ""
+        if alone and self.apart and self.mesh.same_point is not None:
+            count = counted(len(np.unique(self.pairs)), "point")
+            return np.arange(size), [f"{count} at places of others have numbers of their own and come apart"]
+        if alone:
+            raise DatasetError(alone)
         places = len(np.unique(label[kept]))
         if not len(kept):
             return np.arange(size), []
@@ -166,21 +177,22 @@ class Stitching:
         whole[group.ravel()[~self.agree]] = False
         return self.pairs[whole[group.ravel()]]
 
-    def _require_joined(self, label: np.ndarray) -> None:
-        """Elements that have no neighbour although they lie on others cannot be right."""
+    def _alone(self, label: np.ndarray) -> str:
+        """What is wrong if elements have no neighbour although they lie on others."""
         count = np.zeros(len(label), np.int64)
         for block in self.blocks:
             count += np.bincount(label[block.nodes.ravel()], minlength=len(label))
         alone = sum(int((count[label[block.nodes]] == 1).all(axis=1).sum()) for block in self.blocks)
         total = sum(len(block.nodes) for block in self.blocks)
-        if self.disagree and alone > 0.1 * total:
-            what, rows = max(self.disagree.items(), key=lambda one: int(one[1].sum()))
-            at = self.mesh.points[self.pairs[np.argmax(rows), 0]].tolist()
-            raise DatasetError(
-                f"{self.mesh.path}: each element has points of its own, and {what} differs at {rows.sum()} of"
-                f" {counted(len(rows), 'pair')} of points at one place, the first at {at}: average the field at the"
-                " points, or leave it out"
-            )
+        if not self.disagree or alone <= 0.1 * total:
+            return ""
+        what, rows = max(self.disagree.items(), key=lambda one: int(one[1].sum()))
+        at = self.mesh.points[self.pairs[np.argmax(rows), 0]].tolist()
+        return (
+            f"{self.mesh.path}: each element has points of its own, and {what} differs at {rows.sum()} of"
+            f" {counted(len(rows), 'pair')} of points at one place, the first at {at}: average the field at the"
+            " points, or leave it out"
+        )
 
 
 _WHY = {
