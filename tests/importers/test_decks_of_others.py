@@ -36,6 +36,7 @@ def volume(path):
         ["*ELEMENT, TYPE=HEATCAP, ELSET=H", "7, 1", "*HEATCAP, ELSET=H", "12.5,"],
         ["*BOUNDARY", "1, 1, 3", "*AQUA", "-10., 5., 9.81, 1025.", "*END"],
         ["*ELEMENT, TYPE=COH3D8", "2, 5, 6, 7, 8, 5, 6, 7, 8"],
+        ["*ELSET, ELSET=S", "1", "*MEMBRANE, ELSET=P1, MATERIAL=M1", "        0."],
         [
             "*PARAMETER",
             "n = 8",
@@ -97,6 +98,35 @@ def test_what_is_left_out_is_told(tmp_path, lines, told):
 def test_what_would_change_the_mesh_is_refused(tmp_path, lines, message):
     with pytest.raises(DatasetError, match=message):
         deck_mesh(write(tmp_path, *NODES, *CELL, *lines))
+
+
+def test_a_cube_with_two_numbers_behind_its_nodes_is_a_cube(tmp_path):
+    """CalculiX does not read them either. A set of nodes with an option for results has its nodes."""
+    path = write(tmp_path, *NODES, CELL[0], f"{CELL[1]}, 9, 10,", "*NSET, NSET=N, FREQUENCY=100", "1, 2")
+    mesh = read_mesh(path)
+    assert volume(path) == pytest.approx(1) and mesh.groups["N"].tolist() == [0, 1]
+    told = "ignored keywords: ELEMENT (two numbers behind the nodes of each C3D8), NSET (its FREQUENCY)"
+    assert told in mesh.notes
+
+
+@pytest.mark.parametrize("rows", [["9, 10, 11"], ["9"], ["9, 10", "9"], ["9, 10", ""]])
+def test_other_numbers_behind_the_nodes_are_refused(tmp_path, rows):
+    """A line with another number of nodes may be of another type."""
+    lines = [f"{row}{CELL[1][1:]}, {more}".rstrip(", ") for row, more in enumerate(rows, 1)]
+    with pytest.raises(DatasetError, match=r"element \d has (9|1\d) nodes; its type has 8"):
+        read_mesh(write(tmp_path, *NODES, CELL[0], *lines))
+
+
+def test_a_comment_with_a_sign_before_it_may_be_the_first_line(tmp_path):
+    path = write(tmp_path, ">** a cube", ">**", *NODES, *CELL)
+    assert volume(path) == pytest.approx(1)
+    for first in ("1, 0, 0, 0", "> ** a", "x** a", "8 6 1 0 0"):
+        path = write(tmp_path, first, *NODES, *CELL)
+        if first.startswith(">"):
+            assert volume(path) == pytest.approx(1)
+        else:
+            with pytest.raises(DatasetError, match="deck.inp:1: a data line before the first keyword"):
+                read_mesh(path)
 
 
 def test_an_instance_that_repeats_the_mesh_of_its_part_has_it_once(tmp_path):

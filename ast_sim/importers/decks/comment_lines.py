@@ -17,6 +17,9 @@ _NUMBER = re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([dDeE]?[-+]?[0-9]+)?|")
 # Keywords whose data lines are read: a comment among these lines loses some of them.
 _READ = {"NODE", "ELEMENT", "NSET", "ELSET", "SYSTEM", "INSTANCE", "BOUNDARY", "NGEN", "NFILL", "NCOPY", "ELGEN"}
 
+# Keywords whose data lines hold whole numbers: a line with a decimal point belongs to none of these.
+_WHOLE = {"ELEMENT", "NSET", "ELSET", "ELGEN"}
+
 # What may stand behind the target of a line of *BOUNDARY.
 _HELD = {"ENCASTRE", "PINNED", "XSYMM", "YSYMM", "ZSYMM", "XASYMM", "YASYMM", "ZASYMM"}
 
@@ -76,6 +79,8 @@ def require_keyword(keyword: Keyword, before: Keyword | None, known: Iterable[st
         return
     names = {*sets, *(_HELD if before.name == "BOUNDARY" else ())}
     entries = {text.strip('"').upper() for line in keyword.data for text in tokens(line)}
+    if before.name in _WHOLE and any("." in text for text in entries - names):
+        return
     if all(_NUMBER.fullmatch(text) or text in names for text in entries):
         count = len(keyword.data)
         lines = f"the {count} lines after this one seem" if count > 1 else "the line after this one seems"

@@ -7,6 +7,7 @@ error that names it. Keywords that say something else (materials, loads, steps) 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -93,6 +94,9 @@ class _Reader:
             self.deck.ignored["MODELCHANGE, TYPE=ELEMENT (all elements are kept)"] += 1
         elif name in self.handlers:
             unknown = keyword.options.keys() - _OPTIONS[name]
+            if name == "NSET" and "FREQUENCY" in unknown:  # of results; it stands there in a deck of CalculiX's own
+                self.deck.ignored["NSET (its FREQUENCY)"] += 1
+                unknown.remove("FREQUENCY")
             if unknown:
                 raise keyword.error(f"the option {min(unknown)} is not understood here")
             self.handlers[name](keyword)
@@ -158,10 +162,17 @@ class _Reader:
             if name:
                 self.content.element_sets.setdefault(self._key(name), [])
             return
-        numbers, nodes = elements_of(keyword, node_count(kind))
+        numbers, nodes = elements_of(self._without_surplus(keyword, type_name, kind), node_count(kind))
         self.content.blocks.append(ElementBlock(type_name, kind, numbers, nodes, keyword))
         if name:
             self.content.element_sets.setdefault(self._key(name), []).append(Members("", numbers, True))
+
+    def _without_surplus(self, keyword: Keyword, type_name: str, kind: str) -> Keyword:
+        """Some decks have two numbers behind the eight nodes of each hexahedron, which CalculiX does not read."""
+        if kind != "hexahedron" or {len(tokens(line)) for line in keyword.data} != {11}:
+            return keyword
+        self.deck.ignored[f"ELEMENT (two numbers behind the nodes of each {type_name})"] += 1
+        return replace(keyword, data=[replace(line, text=",".join(tokens(line)[:9])) for line in keyword.data])
 
     def _make_nodes(self, keyword: Keyword) -> None:
         if self.system is not None and (keyword.name == "NCOPY" or "LINE" in keyword.options):

@@ -17,6 +17,9 @@ from ast_sim.support.errors import DatasetError
 # A deck includes files that include files up to this depth.
 _DEEPEST = 32
 
+# A comment before the first keyword, behind a sign that a mail or a merge has left.
+_MARKED_COMMENT = re.compile(r"[^\w\s*,.+-]+\s*\*\*")
+
 _NAMED = re.compile(r'\s*("[^"]*"|[^=,"]+?)\s*(?:=\s*("[^"]*"|[^,"]*?)\s*)?(?:,|$)')
 
 
@@ -67,7 +70,7 @@ def read_keywords(path: Path) -> list[Keyword]:
     """
     keywords: list[Keyword] = []
     lines = _lines(path, ())
-    line = next(lines, None)
+    line = next((one for one in lines if not _MARKED_COMMENT.match(one.text)), None)
     while line is not None:
         if not line.text.startswith("*"):
             raise DatasetError(f"{line.place}: a data line before the first keyword: this is no deck of Abaqus")
