@@ -1,5 +1,5 @@
 """Two bodies of second-order tetrahedra, one of which yields under the other: from CalculiX's files to a prediction of
-the plastic strain and of the forces."""
+the plastic strain, of the forces and of the dent that stays."""
 
 import csv
 import re
@@ -24,7 +24,7 @@ def body_lines(nodes, elements, first, name):
 
 
 def deck():
-    """A pad of 2 x 2 x 1, held at its floor, and a punch of 1 x 1 x 1 above its middle, whose top goes down."""
+    """A pad of 2 x 2 x 1, held at its floor, and a punch of 1 x 1 x 1 above its middle, whose top goes down and up."""
     pad, punch = block(2, 2, 1), block(1, 1, 1)
     meshes = [second_order(b.rest_position.astype(float), b.elements) for b in (pad, punch)]
     (low, low_cells), (high, high_cells) = meshes
@@ -42,8 +42,15 @@ def deck():
         *["*SURFACE, NAME=BELOW", *(f"{1001 + row}, S{side}" for row, side in faces_at(punch, 0))],
         *["*SURFACE INTERACTION, NAME=HARD", "*SURFACE BEHAVIOR, PRESSURE-OVERCLOSURE=LINEAR", "2000."],
         *["*CONTACT PAIR, INTERACTION=HARD, TYPE=SURFACE TO SURFACE", "ABOVE, BELOW"],
+        *(line for travel in (-DOWN, 0.0) for line in step(travel)),
+    ]
+
+
+def step(travel):
+    """The top goes to this place in four increments."""
+    return [
         *["*STEP, NLGEOM", "*STATIC, DIRECT", "0.25, 1."],
-        *["*BOUNDARY", "FLOOR, 1, 3", "TOP, 1, 2", f"TOP, 3, 3, {-DOWN}"],
+        *["*BOUNDARY", "FLOOR, 1, 3", "TOP, 1, 2", f"TOP, 3, 3, {travel}"],
         *["*NODE FILE", "U, RF", "*EL FILE", "S, PEEQ", "*END STEP"],
     ]
 
@@ -85,11 +92,19 @@ def test_plastic_strain_and_forces_are_predicted(data, tmp_path, capsys):
     assert relative(answer.fields["PEEQ"].values, truth.fields["PEEQ"].values) < 0.1
     assert not answer.fields["reaction"].values[:, ~scene.prescribed].any()
     told = list(csv.DictReader(forces.read_text().splitlines()))
-    assert [(row["frame"], row["body"]) for row in told] == [(str(f), b) for f in range(5) for b in "01"]
+    assert [(row["frame"], row["body"]) for row in told] == [(str(f), b) for f in range(9) for b in "01"]
     top = scene.prescribed & (scene.body == 1)
     pushed = truth.fields["reaction"].values[:, top].sum(axis=1)[:, 2]
-    np.testing.assert_allclose([float(row["force_z"]) for row in told[1::2]], pushed, atol=0.1 * abs(pushed[-1]))
-    assert -30 < pushed[-1] < -15
+    np.testing.assert_allclose([float(row["force_z"]) for row in told[1::2]], pushed, atol=0.1 * abs(pushed[4]))
+    assert -30 < pushed[4] < -15 and abs(pushed[-1]) < 0.01
+    # The punch is back where it was, and the pad keeps a dent: the permanent set.
+    pad = scene.body == 0
+    np.testing.assert_allclose(truth.position[-1, top], scene.rest_position[top], atol=1e-6)
+    dents = [scene.rest_position[pad] - one.position[-1, pad] for one in (truth, answer)]
+    deepest = np.argmax(dents[0][:, 2])
+    assert 0.3 * DOWN < dents[0][deepest, 2] < 0.9 * DOWN
+    assert dents[1][deepest, 2] == pytest.approx(dents[0][deepest, 2], rel=0.1)
+    assert relative(dents[1], dents[0]) < 0.1
     # The law of a body that yields is not known, so the predicted reactions give the force on the driven nodes.
     again = ast_sim.Run(run).predict(truth)
     np.testing.assert_allclose(again.reaction()[:, 2], [float(row["force_z"]) for row in told[1::2]], rtol=1e-5)
