@@ -103,8 +103,8 @@ def test_plastic_strain_and_forces_are_predicted(data, tmp_path, capsys):
     dents = [scene.rest_position[pad] - one.position[-1, pad] for one in (truth, answer)]
     deepest = np.argmax(dents[0][:, 2])
     assert 0.3 * DOWN < dents[0][deepest, 2] < 0.9 * DOWN
-    assert dents[1][deepest, 2] == pytest.approx(dents[0][deepest, 2], rel=0.1)
-    assert relative(dents[1], dents[0]) < 0.1
+    assert dents[1][deepest, 2] == pytest.approx(dents[0][deepest, 2], rel=0.15)
+    assert relative(dents[1], dents[0]) < 0.15
     # The law of a body that yields is not known, so the predicted reactions give the force on the driven nodes.
     again = ast_sim.Run(run).predict(truth)
     np.testing.assert_allclose(again.reaction()[:, 2], [float(row["force_z"]) for row in told[1::2]], rtol=1e-5)
