@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ast_sim.dataset.layout import SPLITS
+from ast_sim.dataset.layout import CORNERS_ONLY, SPLITS
 from ast_sim.dataset.writer import FittedWriter
 from ast_sim.importers.completeness import require_complete
 from ast_sim.importers.deepmind import convert_deepmind, is_deepmind
@@ -129,7 +129,10 @@ def _agree(writer: FittedWriter, made_by: dict[str, Any], path: Path, trajectory
     """The first simulation says where a stress lives; raise DatasetError if another one says otherwise."""
     if not any(writer.counts.values()):
         made_by |= _facts_of_the_first(trajectory)
-        writer.info = replace(writer.info, stress_location=trajectory.stress_at, generator=made_by)
+        writer.info = replace(writer.info, stress_location=trajectory.stress_at)
+    if CORNERS_ONLY in trajectory.attributes:
+        made_by[CORNERS_ONLY] = True
+    writer.info = replace(writer.info, generator=made_by)
     if trajectory.stress_at != writer.info.stress_location:
         raise DatasetError(
             f"{path}: the place of its stress is {trajectory.stress_at!r}, in the simulations before"
