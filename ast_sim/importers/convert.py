@@ -22,7 +22,7 @@ from ast_sim.importers.order_of_files.left_out import left_out
 from ast_sim.importers.order_of_files.listed import SERIES
 from ast_sim.importers.series import FieldNames, read_series
 from ast_sim.plausibility.across import AcrossSimulations
-from ast_sim.plausibility.findings import Finding, refusal, told
+from ast_sim.plausibility.findings import Finding, refusal, told, wrong
 from ast_sim.scene import Trajectory
 from ast_sim.support.argument_checks import file_name, require_bool, require_type, several
 from ast_sim.support.errors import ConfigError, DatasetError, LooksWrong, nearest_name, warn
@@ -142,8 +142,8 @@ def _agree(writer: FittedWriter, made_by: dict[str, Any], path: Path, trajectory
 
 def _tell(source: Path, findings: list[tuple[str, Finding]], strict: bool) -> None:
     """Warn of what looks wrong; refuse it if `strict`."""
-    if findings and strict:
-        raise DatasetError(f"{source}: {refusal(findings)}")
+    if strict and wrong(findings):
+        raise DatasetError(f"{source}: {refusal(wrong(findings))}")
     for line in told(findings):
         warn(line, LooksWrong)
 
