@@ -147,12 +147,26 @@ def test_no_force_is_promised_where_elements_keep_their_corners_only(pulled, tmp
     assert any("no force of theirs is right" in line for line in scene.warnings) == corners
 
 
-def test_corners_of_linear_elements_are_all_their_nodes(tmp_path):
+def squeezed(folder, kind):
+    """A dataset of a cube that is squeezed, in elements of a kind of meshio, by their corners."""
     cube = block(2, 2, 2)
-    for frame in range(2):
-        points = cube.rest_position * (1, 1, 1 - 0.1 * frame)
-        meshio.Mesh(points, [("tetra", cube.elements)]).write(tmp_path / f"f{frame}.vtu")
+    rest, elements = cube.rest_position.astype(float), cube.elements
+    if kind == "tetra10":
+        rest, elements = second_order(rest, elements)
+    folder.mkdir()
+    for frame in range(3):
+        meshio.Mesh(rest * (1, 1, 1 - 0.1 * frame), [(kind, elements)]).write(folder / f"f{frame}.vtu")
     names = FieldNames(handle="0:zmin")
-    ast_sim.convert(tmp_path, tmp_path / "o.h5", names=names, corners=True, splits={"train": 1}, progress=False)
-    with Dataset(tmp_path / "o.h5") as dataset:
-        assert not dataset.info.corners_only
+    path = folder / "o.h5"
+    ast_sim.convert(folder, path, names=names, corners=True, splits={"train": 1}, progress=False)
+    return path
+
+
+def test_corners_of_linear_elements_are_all_their_nodes_and_a_later_training_knows_of_others(tmp_path):
+    linear, reduced = (squeezed(tmp_path / kind, kind) for kind in ("tetra", "tetra10"))
+    for path, corners_only in ((linear, False), (reduced, True)):
+        with Dataset(path) as dataset:
+            assert (dataset.info.corners_only, dataset.element_size) == (corners_only, 4)
+    run = ast_sim.train(linear, tmp_path / "run", steps=2, progress=False)
+    later = ast_sim.train(reduced, tmp_path / "later", steps=2, from_run=run, progress=False)
+    assert (run.info.corners_only, later.info.corners_only) == (False, True)
