@@ -175,6 +175,27 @@ def turned_over(elements: np.ndarray, wrong: np.ndarray) -> np.ndarray:
     return np.where(wrong[:, None], elements[:, order], elements)
 
 
+def folded_elements(elements: np.ndarray, negative: np.ndarray) -> np.ndarray:
+    """The tetrahedra [E, 4] or [E, 10] that lie on others: at faces of more than two elements, and at faces whose two
+    elements lie on the same side.
+
+    Args:
+        negative: [E] whether the volume between the corners is below 0.
+    """
+    faces = elements[:, np.array(LOCAL_FACES)].reshape(-1, 3).astype(np.int64)
+    # A face runs one way round or the other, seen from its lowest node; two elements beside each other see it both
+    # ways.
+    turned = np.take_along_axis(faces, (np.argmin(faces, axis=1)[:, None] + np.arange(3)) % 3, axis=1)
+    one_way = (turned[:, 1] < turned[:, 2]) ^ np.repeat(negative, 4)
+    keys = np.sort(faces, axis=1)
+    order = np.lexsort(keys.T)
+    start = np.append(True, (keys[order[1:]] != keys[order[:-1]]).any(axis=1))
+    group = np.cumsum(start) - 1
+    count, sides = np.bincount(group), np.bincount(group, one_way[order])
+    wrong = (count > 2) | ((count == 2) & (sides != 1))
+    return np.unique(order[wrong[group]] // 4)
+
+
 def flat_elements(points: np.ndarray, elements: np.ndarray) -> np.ndarray:
     """[E] bool: the tetrahedra without a volume between their corners, or the triangles without an area."""
     coordinates = np.ascontiguousarray(points.T, np.float64)

@@ -159,10 +159,9 @@ def info(args: argparse.Namespace) -> None:
     else:
         facts = describe_dataset(args.path)
     print(json.dumps(facts, indent=1) if args.json else text(_with_answers_in_words(facts)))
-    if args.strict and facts.get("looks_wrong"):
-        raise DatasetError(
-            f"{args.path}: {counted(len(facts['looks_wrong']), 'thing looks', 'things look')} wrong in it"
-        )
+    wrong = [one for one in facts.get("looks_wrong", ()) if not one["may_be_meant"]]
+    if args.strict and wrong:
+        raise DatasetError(f"{args.path}: {counted(len(wrong), 'thing looks', 'things look')} wrong in it")
 
 
 def _with_answers_in_words(facts: dict[str, Any]) -> dict[str, Any]:
@@ -322,12 +321,14 @@ def _truth(run: Any, args: argparse.Namespace) -> Any:
 def _scene(args: argparse.Namespace) -> Any:
     """The scene of a mesh; prints its description."""
     from ast_sim.importers.scene_mesh import parse_material, read_scene
+    from ast_sim.inference.predict_arguments import doubts_at_rest
 
     marks = {"obstacles": args.obstacle, "clamps": args.clamp, "corners": args.corners}
     fields = {"body_field": args.body_field, "type_field": args.type_field}
     materials = by_name("--material", map(parse_material, args.material))
     read = read_scene(args.scene, **marks, **fields, materials=materials or None)
-    print("\n".join(map(printable, read.description)))
+    told_later = {f"warning: {doubt}" for doubt in doubts_at_rest(read.scene)}  # by the prediction
+    print("\n".join(printable(line) for line in read.description if line not in told_later))
     return read.scene
 
 

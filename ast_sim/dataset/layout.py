@@ -38,6 +38,7 @@ FRAMED = ("position", "stress", "cauchy_stress")
 FIELDS = "fields"  # the group of the named fields of a trajectory; each is an array of this kind
 FIELD_KIND = (np.float32, 3)
 NUMBERING = ("frames", "times")  # attributes of a trajectory that tell of its frames; they may be missing
+CORNERS_ONLY = "corners_only"  # an entry of `DatasetInfo.generator`, and an attribute of a trajectory
 LENGTH_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254}  # in metres
 Integration = Literal["quasi_static", "dynamic"]
 StressLocation = Literal["none", "node", "element"]
@@ -66,6 +67,7 @@ class DatasetInfo:
         length_unit: "m", "cm", "mm", "um" or "in".
         generator: the origin of the data, such as program, versions, command, seed and licence. Its entry `material` is
             a list: the name of each column of `Scene.material`, such as ["young", "poisson"] (`ast_sim.Material`).
+            Its entry `corners_only` is true if elements were of a higher order and keep their corners only.
     """
 
     family: str
@@ -118,6 +120,12 @@ class DatasetInfo:
                 f"{name}: generator['material'] is {columns!r}; must be a list with one name for each column of the"
                 " material, such as ['young', 'poisson']"
             )
+
+    @property
+    def corners_only(self) -> bool:
+        """Whether elements were of a higher order and keep their corners only: they are stiffer, so no force of theirs
+        is right."""
+        return bool(self.generator.get(CORNERS_ONLY, False))
 
     def in_unit(self, unit: str, name: str) -> DatasetInfo:
         """The same facts in another unit of length.

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ast_sim.dataset.layout import SPLITS
+from ast_sim.dataset.layout import CORNERS_ONLY, SPLITS
 from ast_sim.dataset.writer import FittedWriter
 from ast_sim.importers.completeness import require_complete
 from ast_sim.importers.deepmind import convert_deepmind, is_deepmind
@@ -22,7 +22,7 @@ from ast_sim.importers.order_of_files.left_out import left_out
 from ast_sim.importers.order_of_files.listed import SERIES
 from ast_sim.importers.series import FieldNames, read_series
 from ast_sim.plausibility.across import AcrossSimulations
-from ast_sim.plausibility.findings import Finding, refusal, told
+from ast_sim.plausibility.findings import Finding, refusal, told, wrong
 from ast_sim.scene import Trajectory
 from ast_sim.support.argument_checks import file_name, require_bool, require_type, several
 from ast_sim.support.errors import ConfigError, DatasetError, LooksWrong, nearest_name, warn
@@ -129,7 +129,10 @@ def _agree(writer: FittedWriter, made_by: dict[str, Any], path: Path, trajectory
     """The first simulation says where a stress lives; raise DatasetError if another one says otherwise."""
     if not any(writer.counts.values()):
         made_by |= _facts_of_the_first(trajectory)
-        writer.info = replace(writer.info, stress_location=trajectory.stress_at, generator=made_by)
+        writer.info = replace(writer.info, stress_location=trajectory.stress_at)
+    if CORNERS_ONLY in trajectory.attributes:
+        made_by[CORNERS_ONLY] = True
+    writer.info = replace(writer.info, generator=made_by)
     if trajectory.stress_at != writer.info.stress_location:
         raise DatasetError(
             f"{path}: the place of its stress is {trajectory.stress_at!r}, in the simulations before"
@@ -139,8 +142,8 @@ def _agree(writer: FittedWriter, made_by: dict[str, Any], path: Path, trajectory
 
 def _tell(source: Path, findings: list[tuple[str, Finding]], strict: bool) -> None:
     """Warn of what looks wrong; refuse it if `strict`."""
-    if findings and strict:
-        raise DatasetError(f"{source}: {refusal(findings)}")
+    if strict and wrong(findings):
+        raise DatasetError(f"{source}: {refusal(wrong(findings))}")
     for line in told(findings):
         warn(line, LooksWrong)
 

@@ -46,6 +46,7 @@ class MeshFile:
         shells: if there are shells beside the tetrahedra; their layers are among the elements and the points.
         edges: [M, 2] the points at the ends of the edges in whose middles the last M points lie.
         mirrored: whether all elements were inside out in the file.
+        reduced: whether elements keep their corners only, though they have further nodes in the file.
     """
 
     source: SourceMesh
@@ -58,6 +59,7 @@ class MeshFile:
     shells: Shells | None = None
     edges: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), np.int64))
     mirrored: bool = False
+    reduced: bool = False
 
     @property
     def path(self) -> Path:
@@ -263,7 +265,8 @@ def mesh_of(mesh: SourceMesh, stitching: Stitching, corners: bool = False) -> Me
         elements = np.concatenate([elements, shells.tetrahedra(points)])
         node_rows = np.concatenate([node_rows, shells.nodes])
         element_rows = np.concatenate([element_rows, np.repeat(rows, 3)])
-    plain = MeshFile(mesh, points, elements, node_rows, element_rows, notes, groups, shells, mirrored=taken.mirrored)
+    made = MeshFile(mesh, points, elements, node_rows, element_rows, notes, groups, shells)
+    plain = replace(made, mirrored=taken.mirrored, reduced=taken.reduced)
     return plain if taken.middles is None else _of_second_order(plain, taken.middles)
 
 

@@ -99,6 +99,8 @@ def read_scene(
             " clamps=['BODY:PLACE'] (--clamp BODY:PLACE), for example 0:xmin"
         )
     scene.check(str(mesh.path))
+    if mesh.reduced:
+        doubts.append("elements keep their corners only: they are stiffer, so no force of theirs is right")
     doubts += rounding(mesh.points[used], scene.rest_position, scene.elements)
     return SceneMesh(scene, [*mesh.notes], [*doubts, *map(str, at_rest(scene))])
 

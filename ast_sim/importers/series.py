@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from ast_sim.dataset.layout import CORNERS_ONLY
 from ast_sim.importers.formats.source_mesh import SourceMesh
 from ast_sim.importers.formats.together import labelled, require_one_time, together
 from ast_sim.importers.frames_in_file import frames_in, only_frame
@@ -142,21 +143,17 @@ def read_series(
     require_extent(str(source), rest, scene.elements)
     origin = far_origin(position[0]) if origin is None else origin
     warn_of_rounding(source, rest - origin, position - origin)
-    scene = replace(
-        scene,
-        rest_position=(rest - origin).astype(np.float32),
-        node_type=types,
-        material=_material(mesh, names, job is not None),
-    )
+    scene = replace(scene, rest_position=(rest - origin).astype(np.float32), node_type=types)
+    scene = replace(scene, material=_material(mesh, names, job is not None))
     stress, more = _stress(mesh, kept, used, place, scene, _pascals(names))
     rigid = {at: ~scene.deforming(at) for at in ("node", "element")}
     fields, missing = further.named(source, mesh.at_nodes(used), mesh.element_rows, rigid, names.newton)
-    told = [*mesh.notes, *notes, *more, *missing]
+    done = {name: 1 for name, is_so in ((MIRRORED, mesh.mirrored), (CORNERS_ONLY, mesh.reduced)) if is_so}
     trajectory = Trajectory(
         scene,
         (position - origin).astype(np.float32),
         stress,
-        _attributes(source, origin, names, told) | ({MIRRORED: 1} if mesh.mirrored else {}),
+        _attributes(source, origin, names, [*mesh.notes, *notes, *more, *missing]) | done,
         stress_location=place,
         times=kept.ascending_times(),
         fields=fields,

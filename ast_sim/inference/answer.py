@@ -13,17 +13,17 @@ import numpy as np
 from ast_sim.dataset.layout import DatasetInfo
 from ast_sim.dataset.writer import DatasetWriter
 from ast_sim.inference.quantities.answered_frame import AnsweredFrame
-from ast_sim.inference.quantities.band import LEVEL, Band, how_far
+from ast_sim.inference.quantities.band import LEVEL, Band, band_of, how_far
 from ast_sim.inference.quantities.forces_and_figures import (
     BodyForce,
     figures_of,
-    force_on_driven,
+    force_on,
     forces_on_bodies,
     write_figures,
     write_forces,
 )
 from ast_sim.inference.quantities.frames_of_answers import require_frames, time_of
-from ast_sim.inference.quantities.relative_errors import errors_of, require_quantity, require_same_motion
+from ast_sim.inference.quantities.relative_errors import errors_of, require_same_motion
 from ast_sim.mechanics.driven import Driven
 from ast_sim.mechanics.linearised.linearised_contact import STILL
 from ast_sim.mechanics.physics_check import Law, PhysicsCheck, check_physics
@@ -230,8 +230,11 @@ class Answer:
             fields={name: one.select(order.tolist()) for name, one in self.fields.items()},
         )
 
-    def reaction(self) -> np.ndarray:
-        """[S, 3] the force in newton on the prescribed nodes `driven`.
+    def reaction(self, nodes: np.ndarray | Sequence[int] | None = None) -> np.ndarray:
+        """[S, 3] the force in newton on prescribed nodes.
+
+        Args:
+            nodes: [N] bool, or numbers: the nodes, such as the held end of a part; None: `driven`.
 
         If the answer has nodal reactions (`fields["reaction"]`), it is their sum. Without them, as after Newton steps,
         it follows from the strains of the positions, if the law of the material is known and elastic: the law of
@@ -239,9 +242,11 @@ class Answer:
 
         Raises:
             ConfigError: there is none; the text says why: no prescribed node moves; or the scene has inertia or no
-                tetrahedra, or the law of its material is not known, and the model predicts no reactions.
+                tetrahedra, or the law of its material is not known, and the model predicts no reactions. Or a node is
+                free or no node of the scene; or some nodes of a rigid body are left out, where forces follow from
+                positions.
         """
-        return force_on_driven(self)
+        return force_on(self, nodes)
 
     def band(self, quantity: str = "displacement") -> np.ndarray | None:
         """[S] how far from the truth the answer may be, with a probability of 95 % in all frames at once
@@ -250,9 +255,11 @@ class Answer:
         Args:
             quantity: "displacement": of all free nodes, in the unit of length; "reaction": of the force on `driven`, in
                 newton; "stress": of the largest stress, in pascal.
+
+        Raises:
+            ConfigError: there is no such quantity; or it is a force, and elements of the data keep their corners only.
         """
-        require_quantity(quantity, self.bands)
-        return self.bands[quantity].around(self, quantity) if quantity in self.bands else None
+        return band_of(self, quantity)
 
     def errors(self, truth: Trajectory) -> dict[str, float]:
         """Relative errors where a simulation is known: in the deepest frame, the one of the predicted frames that both

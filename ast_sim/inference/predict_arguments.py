@@ -67,7 +67,12 @@ def new_question(
     scene.require_predictable(name)  # before anything is told of such a scene
     _require_material(config, scope, scene, name)
     _require_resolved(scene, name)
-    notes = (*notes, *_loose(scene), *_at_rest(scene), *scope.notes(scene, motion, config.scheme.needs_each_frame))
+    notes = (
+        *notes,
+        *_loose(scene),
+        *doubts_at_rest(scene),
+        *scope.notes(scene, motion, config.scheme.needs_each_frame),
+    )
     question = Question(name, scene, motion.position, fields, movable=True, notes=notes, times=times)
     return question.asking(frames)
 
@@ -112,7 +117,7 @@ def _loose(scene: Scene) -> list[str]:
     return [f"{told} to no element: what is predicted for them means nothing"]
 
 
-def _at_rest(scene: Scene) -> list[str]:
+def doubts_at_rest(scene: Scene) -> list[str]:
     """Notes if bodies lie in each other at rest, or a mesh folds over itself; looked at once for each scene."""
     if scene not in _AT_REST:
         _AT_REST[scene] = [str(finding) for finding in no_scene(scene)]

@@ -120,7 +120,7 @@ class Run:
             contact_radius=model.data.contact_radius,
             time_step=scope.time_step,
             length_unit=scope.length_unit,
-            generator={"program": "ast_sim predict", "material": list(model.data.columns)},
+            generator={"program": "ast_sim predict", **model.data.generator},
         )
 
     def predict(

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
-from ast_sim.dataset.layout import GIVEN_FRAMES, DatasetInfo, Integration, StressLocation
+from ast_sim.dataset.layout import CORNERS_ONLY, GIVEN_FRAMES, DatasetInfo, Integration, StressLocation
 from ast_sim.material import FRICTION, Material
 from ast_sim.named_field import STRESS, Output
 from ast_sim.support.toml_settings import NOTHING
@@ -25,6 +26,7 @@ class DataFacts:
         contact_radius: distance within which surfaces count as near.
         mesh_spacing: mean length of a mesh edge of the deforming bodies at rest.
         tetrahedra: whether the elements are tetrahedra.
+        corners_only: whether elements were of a higher order and keep their corners only; no force is right then.
         planar: whether z is 0 in all scenes.
         young, poisson, contact_range, friction: what the solver recorded, and is the same in all scenes: Young's
             modulus and Poisson's ratio of all elements, distance below which its surfaces repel, coefficient of
@@ -40,6 +42,7 @@ class DataFacts:
     contact_radius: float = 0.0
     mesh_spacing: float = 0.0
     tetrahedra: bool = False
+    corners_only: bool = False
     planar: bool = False
     young: float = 0.0
     poisson: float = 0.0
@@ -67,10 +70,16 @@ class DataFacts:
             domain_half_width=float(info.domain_half_width),
             contact_radius=float(info.contact_radius),
             mesh_spacing=mesh_spacing,
+            corners_only=info.corners_only,
             tetrahedra=tetrahedra,
             planar=planar,
             **recorded,
         )
+
+    @property
+    def generator(self) -> dict[str, Any]:
+        """What an answer keeps of the origin of the data, as `DatasetInfo.generator` has it."""
+        return {"material": list(self.columns), **({CORNERS_ONLY: True} if self.corners_only else {})}
 
     @property
     def outputs(self) -> tuple[Output, ...]:

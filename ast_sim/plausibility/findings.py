@@ -21,15 +21,17 @@ class Finding:
         count: how often.
         places: the first places, as text.
         meaning: what follows from it.
+        may_be_meant: whether it may well be as it should: `--strict` lets it pass.
     """
 
     what: str
     count: int
     places: str
     meaning: str
+    may_be_meant: bool = False
 
     def __str__(self) -> str:
-        return f"{self.count} {self.what} ({self.places}): {self.meaning}"
+        return f"{_counted(self.count, self.what)} ({self.places}): {self.meaning}"
 
 
 Findings = Sequence[tuple[str, Finding]]  # the name of a scene or simulation, and what looks wrong in it
@@ -41,6 +43,11 @@ def told(findings: Findings) -> list[str]:
     widths = [max(len(row[column]) for row in rows) for column in (0, 1)]
     lines = [f"{one:{widths[0]}}  {where:{widths[1]}}  {meaning}" for one, where, meaning in rows]
     return lines if findings else []
+
+
+def wrong(findings: Findings) -> Findings:
+    """The findings that cannot be meant."""
+    return [(name, finding) for name, finding in findings if not finding.may_be_meant]
 
 
 def refusal(findings: Findings) -> str:
@@ -60,9 +67,12 @@ def _rows(findings: Findings) -> list[tuple[str, str, str]]:
         listed = ", ".join(names[:_PLACES]) + (", ..." if len(names) > _PLACES else "")
         several = f"in {len(names)} simulations ({listed}); " if len(names) > 1 else ""
         total = sum(finding.count for _, finding in of_kind)
-        counted = f"{total:,} {what}" if total > 1 else f"{what}: {total}"  # the noun is a plural
-        rows.append((counted, f"{several}{name}: {first.places}", first.meaning))
+        rows.append((_counted(total, what), f"{several}{name}: {first.places}", first.meaning))
     return rows
+
+
+def _counted(number: int, what: str) -> str:
+    return f"{number:,} {what}" if number > 1 else f"{what}: {number}"  # the noun is a plural
 
 
 def places(kind: str, rows: np.ndarray, points: np.ndarray | None = None) -> str:

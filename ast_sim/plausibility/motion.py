@@ -55,8 +55,10 @@ def in_trajectory(trajectory: Trajectory, dynamic: bool = False) -> list[Finding
         *_soft_tools(scene, position),
     ]
     findings += _turn_over(scene, position)
-    if dynamic:  # else a frame is the one before once more wherever all prescribed nodes hold still
+    if dynamic:
         findings += _stops_dead(position)
+    elif "source" in trajectory.attributes:  # of other programs: of the bundled solver, a pause is one
+        findings += _pauses(position)
     findings += negative_stress(trajectory)
     findings += [*change_places(scene, position), *counted_from_frame_before(scene, position)]
     return [*findings, *_contact(scene, position)]
@@ -154,6 +156,17 @@ def _stops_dead(position: np.ndarray) -> list[Finding]:
         return []
     meaning = "each is the frame before it once more, but inertia does not stop at once: was it written twice?"
     return [Finding("frames that repeat", len(rows), places("frames", rows), meaning)]
+
+
+def _pauses(position: np.ndarray) -> list[Finding]:
+    """Frames with the positions of the frame before, where others move. Without inertia a frame is the one before once
+    more wherever all prescribed nodes hold still."""
+    same = (position[1:] == position[:-1]).all(axis=(1, 2))
+    rows = 1 + np.flatnonzero(same)
+    if not len(rows) or same.all():
+        return []
+    meaning = "each is the frame before it once more: a pause of the motion, or was it written twice?"
+    return [Finding("frames that repeat", len(rows), places("frames", rows), meaning, may_be_meant=True)]
 
 
 def _contact(scene: Scene, position: np.ndarray) -> list[Finding]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ast_sim.element_topology import LOCAL_FACES, equal_rows, point_volumes
+from ast_sim.element_topology import equal_rows, folded_elements, point_volumes
 from ast_sim.number_arrays import connected_parts
 from ast_sim.plausibility.findings import Finding, places
 from ast_sim.plausibility.overlaps import overlaps
@@ -74,19 +74,7 @@ def folded_inside_out(scene: Scene) -> list[Finding]:
 
 def folds(scene: Scene) -> list[Finding]:
     """Faces of more than two elements, and faces whose two elements lie on the same side of them."""
-    faces = scene.elements[:, np.array(LOCAL_FACES)].reshape(-1, 3).astype(np.int64)
-    negative = np.repeat(scene.rest_volumes < 0, 4)
-    # A face runs one way round or the other, seen from its lowest node; two elements beside each other see it both
-    # ways.
-    turned = np.take_along_axis(faces, (np.argmin(faces, axis=1)[:, None] + np.arange(3)) % 3, axis=1)
-    one_way = (turned[:, 1] < turned[:, 2]) ^ negative
-    keys = np.sort(faces, axis=1)
-    order = np.lexsort(keys.T)
-    start = np.append(True, (keys[order[1:]] != keys[order[:-1]]).any(axis=1))
-    group = np.cumsum(start) - 1
-    count, sides = np.bincount(group), np.bincount(group, one_way[order])
-    wrong = (count > 2) | ((count == 2) & (sides != 1))
-    rows = np.unique(order[wrong[group]] // 4)
+    rows = folded_elements(scene.elements, scene.rest_volumes < 0)
     if not len(rows):
         return []
     meaning = "the mesh folds over itself there, so it cannot be computed with: mesh it again"

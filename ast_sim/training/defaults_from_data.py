@@ -50,7 +50,8 @@ def resolve(config: RunConfig, dataset: Dataset, scales: DataScales, keep_model:
         fields=_fields(dataset, config.model.state),
     )
     if keep_model:
-        model = dataclasses.replace(config.model, data=dataclasses.replace(config.model.data, **scales.recorded))
+        newer = {"corners_only": facts.corners_only, **scales.recorded}
+        model = dataclasses.replace(config.model, data=dataclasses.replace(config.model.data, **newer))
     else:
         model = config.model.resolve(facts)
     if config.train.scenes is not None:

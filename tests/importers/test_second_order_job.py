@@ -1,7 +1,9 @@
 """A body of second-order tetrahedra that CalculiX pulls: its ten nodes are kept from the files to the force."""
 
 import subprocess
+import warnings
 
+import meshio
 import numpy as np
 import pytest
 from blocks import block
@@ -10,6 +12,9 @@ import ast_sim
 from ast_sim import Dataset, cli
 from ast_sim.importers.formats.vtk_files import vtk_frames
 from ast_sim.importers.series import FieldNames, read_series
+from ast_sim.inference.promises.calibration import Calibration
+from ast_sim.inference.promises.kept_errors import KeptErrors
+from ast_sim.inference.quantities.band import compared
 from ast_sim.scene import NodeType
 from ast_sim.simulate.shapes.mesh import second_order
 
@@ -93,3 +98,75 @@ def test_corners_are_taken_when_they_are_asked_for(pulled):
     assert np.array_equal(used[read.scene.elements], elements[:, :4])
     np.testing.assert_allclose(read.scene.rest_position, nodes[used], atol=1e-6)
     assert f"{len(elements)} cells of the kind C3D10 keep their corners only" in read.attributes["notes"]
+
+
+def told_by(function, *arguments):
+    """What it returns, and its warnings."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        result = function(*arguments)
+    return result, [str(one.message) for one in caught]
+
+
+STIFFER = "the run learned from elements of a higher order by their corners only"
+
+
+@pytest.mark.parametrize("corners", [False, True])
+def test_no_force_is_promised_where_elements_keep_their_corners_only(pulled, tmp_path, corners):
+    """The fact goes from the files to the dataset, the run, its answers and their files. Ten nodes are no such fact."""
+    job, results, *_ = pulled
+    data = tmp_path / "d.h5"
+    units = {"length_unit": "mm", "names": FieldNames(stress_unit="MPa")}
+    ast_sim.convert(results, data, deck=job, corners=corners, splits={"train": 1}, progress=False, **units)
+    with Dataset(data) as dataset:
+        assert dataset.info.corners_only == corners
+        truth = dataset["train"][0]
+    run = ast_sim.train(data, tmp_path / "run", steps=2, progress=False)
+    assert run.info.corners_only == corners
+    answer = run.predict(truth, frames=[-1], effort=ast_sim.Effort(newton_steps=10))
+    for force in (answer.reaction, answer.body_forces, lambda: answer.save_forces(tmp_path / "f.csv")):
+        _, lines = told_by(force)
+        assert [STIFFER in line for line in lines] == corners * [True]
+    assert "the force is not the one of the simulations" in "".join(lines) or not corners
+    assert ("reaction" in compared(answer, truth)) != corners
+    assert answer.band() is None
+    run.calibration = Calibration(20, (), {}, {}, (0.1, 10.0), KeptErrors((), {}), None)
+    if corners:
+        with pytest.raises(ast_sim.ConfigError, match=f"no force is promised: {STIFFER}"):
+            answer.band("reaction")
+        with pytest.raises(ast_sim.ConfigError, match=f"promises no force: {STIFFER}"):
+            run.predict(truth, error={"reaction": 0.1})
+    else:
+        assert answer.band("reaction") is None
+    answer.save(tmp_path / "a.h5")
+    with Dataset(tmp_path / "a.h5") as saved:
+        assert saved.info.corners_only == corners
+    later = ast_sim.train(data, tmp_path / "later", steps=2, from_run=run, progress=False)
+    assert later.info.corners_only == corners
+    scene = ast_sim.read_scene(results, clamps=["0:zmin"], corners=corners)
+    assert any("no force of theirs is right" in line for line in scene.warnings) == corners
+
+
+def squeezed(folder, kind):
+    """A dataset of a cube that is squeezed, in elements of a kind of meshio, by their corners."""
+    cube = block(2, 2, 2)
+    rest, elements = cube.rest_position.astype(float), cube.elements
+    if kind == "tetra10":
+        rest, elements = second_order(rest, elements)
+    folder.mkdir()
+    for frame in range(3):
+        meshio.Mesh(rest * (1, 1, 1 - 0.1 * frame), [(kind, elements)]).write(folder / f"f{frame}.vtu")
+    names = FieldNames(handle="0:zmin")
+    path = folder / "o.h5"
+    ast_sim.convert(folder, path, names=names, corners=True, splits={"train": 1}, progress=False)
+    return path
+
+
+def test_corners_of_linear_elements_are_all_their_nodes_and_a_later_training_knows_of_others(tmp_path):
+    linear, reduced = (squeezed(tmp_path / kind, kind) for kind in ("tetra", "tetra10"))
+    for path, corners_only in ((linear, False), (reduced, True)):
+        with Dataset(path) as dataset:
+            assert (dataset.info.corners_only, dataset.element_size) == (corners_only, 4)
+    run = ast_sim.train(linear, tmp_path / "run", steps=2, progress=False)
+    later = ast_sim.train(reduced, tmp_path / "later", steps=2, from_run=run, progress=False)
+    assert (run.info.corners_only, later.info.corners_only) == (False, True)

@@ -5,10 +5,12 @@ import numpy as np
 import pytest
 from blocks import block
 
+from ast_sim.cli import main
 from ast_sim.dataset.contents import describe_dataset
 from ast_sim.importers.convert import convert
 from ast_sim.importers.series import FieldNames, read_series
 from ast_sim.plausibility.motion import in_trajectory
+from ast_sim.scene import Trajectory
 from ast_sim.support.errors import DatasetError
 
 CUBE = block(1, 1, 1)
@@ -64,3 +66,49 @@ def test_a_poissons_ratio_that_cannot_be_one_is_told(tmp_path, poisson, told_of)
     write(tmp_path / "a", 0.1, poisson=poisson)
     findings = in_trajectory(read_series(tmp_path / "a", FieldNames(handle="0:zmin", material=("poisson=nu",))))
     assert [one.what for one in findings] == told_of * ["elements whose Poisson's ratio cannot be one"]
+
+
+@pytest.mark.parametrize(
+    ("order", "places"),
+    [
+        ((0, 1, 1, 2), ["frames 2"]),  # a pause
+        ((0, 1, 2, 2, 2), ["frames 3, 4"]),  # a hold at the end
+        ((0, 0, 1, 2), ["frames 1"]),
+        ((0, 0, 1, 1, 2, 2, 1, 1), ["frames 1, 3, 5, ..."]),  # each one twice
+        ((0, 1, 0, 1, 2), []),  # there and back: no frame is the one before
+    ],
+)
+def test_frames_that_repeat_are_told_but_may_be_meant(tmp_path, recwarn, order, places):
+    """Without inertia a frame is the one before once more wherever the prescribed nodes hold still, so a look tells it,
+    and --strict lets it pass. Where nothing moves at all, that is told alone."""
+    (tmp_path / "a").mkdir()
+    for number, place in enumerate(order):
+        points = CUBE.rest_position * (1, 1, 1 - 0.1 * place)
+        meshio.Mesh(points, [("tetra", CUBE.elements)]).write(tmp_path / "a" / f"f{number}.vtu")
+    convert(tmp_path, tmp_path / "o.h5", names=NAMES, splits={"train": 1}, strict=True, progress=False)
+    wrong = describe_dataset(tmp_path / "o.h5")["looks_wrong"]
+    assert [one["places"] for one in wrong] == places and all(one["may_be_meant"] for one in wrong)
+    lines = [str(one.message) for one in recwarn]
+    repeats = sum(one == other for one, other in zip(order, order[1:], strict=False))
+    counted = f"{repeats} frames that repeat" if repeats > 1 else "frames that repeat: 1"
+    assert sum(counted in line and "a pause of the motion, or was it written twice?" in line for line in lines) == bool(
+        places
+    )
+    assert main(["info", str(tmp_path / "o.h5"), "--strict"]) == 0
+
+
+def test_what_cannot_be_meant_is_refused_beside_frames_that_repeat(tmp_path):
+    for name in "ab":
+        write(tmp_path / name, 0.1)
+        (tmp_path / name / "f3.vtu").write_bytes((tmp_path / name / "f2.vtu").read_bytes())
+    with pytest.raises(DatasetError, match="stand in the data twice: 1 .b: as a.*leave one out$") as caught:
+        convert(tmp_path, tmp_path / "o.h5", names=NAMES, splits={"train": 1}, strict=True, progress=False)
+    assert "repeat" not in str(caught.value)
+    with pytest.warns(UserWarning):
+        convert(tmp_path, tmp_path / "o.h5", names=NAMES, splits={"train": 1}, progress=False)
+    assert main(["info", str(tmp_path / "o.h5"), "--strict"]) == 2
+
+
+def test_a_simulation_without_motion_is_told_as_that_alone():
+    still = Trajectory(CUBE, np.repeat(CUBE.rest_position[None], 3, axis=0), attributes={"source": "a"})
+    assert [one.what for one in in_trajectory(still)] == ["simulations without motion"]

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import ast_sim
+from ast_sim.cli import main
 from ast_sim.inference.answering import doubts
 from ast_sim.support.errors import DatasetError, RolloutError
 
@@ -125,6 +126,27 @@ def test_bodies_that_overlap_at_rest_are_told_as_of_files(held):
     twice = ast_sim.Scene.join(scene, scene)
     lines = told(twice, np.concatenate([motion, motion], axis=1))[1]
     assert any("body 2 stands where body 0 stands, wholly or in part, at the start; scenes" in line for line in lines)
+
+
+def test_the_command_line_tells_an_overlap_once(held, tmp_path, capsys):
+    """It describes the mesh before the prediction warns; what else looks wrong at rest stays in the description."""
+    scene, _ = held
+    inside = scene.rest_position - np.float32([0, 0, 0.033]) * (scene.body == 1)[:, None]
+    mesh = replace(scene, rest_position=inside).to_meshio()
+    mesh.points = np.concatenate([mesh.points, [[0.3, 0, 0], [0.31, 0, 0], [0.3, 0.01, 0], [0.3, 0, 0.01]]])
+    mesh.cells[0].data = np.concatenate([mesh.cells[0].data, len(mesh.points) - 4 + np.arange(4)[None]])
+    mesh.point_data = {"node_type": np.append(mesh.point_data["node_type"], np.full(4, 3))}
+    mesh.cell_data = {}
+    mesh.write(tmp_path / "mesh.vtu")
+    move = ["--move", "1=0,0,-0.02", "--out", str(tmp_path / "a.h5")]
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        code = main(["predict", str(ast_sim.example_run("plates").path), str(tmp_path / "mesh.vtu"), *move])
+    assert code == 0
+    lines = "".join(capsys.readouterr()).splitlines()
+    (told_of,) = [line for line in lines if "overlap" in line]
+    assert "pairs of bodies that overlap: 1 (at" in told_of and "body 1 lies 0.025 inside body 0" in told_of
+    assert sum("warning: bodies of one element: 1 (elements" in line for line in lines) == 1
 
 
 def test_overlaps_are_looked_for_once_in_a_scene(held, monkeypatch):

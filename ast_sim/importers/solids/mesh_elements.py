@@ -31,6 +31,7 @@ class Elements:
         blocks: the numbers of the blocks that became elements.
         notes: sentences on what was changed.
         mirrored: whether all elements were inside out.
+        reduced: whether some keep their corners only, though they have further nodes.
     """
 
     nodes: np.ndarray
@@ -39,6 +40,7 @@ class Elements:
     blocks: list[int]
     notes: list[str]
     mirrored: bool = False
+    reduced: bool = False
 
 
 def elements_of(mesh: SourceMesh, point_of: np.ndarray, corners: bool = False) -> Elements:
@@ -83,20 +85,21 @@ def elements_of(mesh: SourceMesh, point_of: np.ndarray, corners: bool = False) -
         nodes.append(cells)
         middles.append(middle)
         rows.append(row)
-    said = [*_reduced(mesh, chosen, corners), *told]
+    reduced = _reduced(mesh, chosen, corners)
+    said = [*reduced, *told]
     if twice:
         are = counted(twice, "element that stands in the file twice is", "elements that stand in the file twice are")
         said.append(f"{are} taken once")
     elements, middle, row = (np.concatenate(parts) for parts in (nodes, middles, rows))
     if dimension == 2:
-        return Elements(elements, None, row, chosen, said)
+        return Elements(elements, None, row, chosen, said, reduced=bool(reduced))
     second = not corners and bool((middle != NO_NODE).any())
     if second:
         require_near(mesh, elements, middle, row)
     turned, more = _turned_over(mesh, elements, row, starts)
     elements, middle = turned_over(elements, turned), turned_over(middle, turned)
     mirrored = bool(turned.all()) and all(mesh.blocks[index].shape != "wedge" for index in chosen)
-    return Elements(elements, middle if second else None, row, chosen, [*said, *more], mirrored)
+    return Elements(elements, middle if second else None, row, chosen, [*said, *more], mirrored, bool(reduced))
 
 
 def _reduced(mesh: SourceMesh, chosen: list[int], corners: bool) -> list[str]:

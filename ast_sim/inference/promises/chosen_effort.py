@@ -9,6 +9,7 @@ from ast_sim.inference.effort import Effort, require_effort
 from ast_sim.inference.promises.kept_errors import DISPLACEMENT, KEPT, in_words
 from ast_sim.inference.promises.known_weights import forget_other_weights
 from ast_sim.inference.promises.milliseconds import effort_within
+from ast_sim.inference.quantities.forces_and_figures import STIFFER
 from ast_sim.support.errors import ConfigError, warn
 
 if TYPE_CHECKING:
@@ -45,6 +46,8 @@ def _keeping(
     """The cheapest effort that keeps errors; a question unlike the calibration scenes is told, and promised nothing."""
     if run.calibration is None:
         raise ConfigError(f"{run.path} promises no error before it is calibrated: ast-sim calibrate RUN DATA")
+    if "reaction" in wanted and run.info.corners_only:
+        raise ConfigError(f"{run.path} promises no force: {STIFFER}")
     effort = run.calibration.kept.effort_for(wanted)
     promise = f"the cheapest that keeps {in_words(wanted)} at the deepest frame in {100 * KEPT:g} % of scenes like it"
     facts = []

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ast_sim.inference.quantities.relative_errors import truth_in_place
+from ast_sim.inference.quantities.forces_and_figures import STIFFER
+from ast_sim.inference.quantities.relative_errors import require_quantity, truth_in_place
 from ast_sim.number_arrays import percent
 from ast_sim.scene import Trajectory
 from ast_sim.support.errors import ConfigError
@@ -42,6 +43,14 @@ class Band:
         return np.where(answer.computed, self.width * (_sizes(VALUES[quantity](answer)) + self.typical), 0)
 
 
+def band_of(answer: Answer, quantity: str) -> np.ndarray | None:
+    """See `Answer.band`."""
+    require_quantity(quantity, answer.bands)
+    if quantity == "reaction" and answer.info is not None and answer.info.corners_only:
+        raise ConfigError(f"{answer.name}: no force is promised: {STIFFER}")
+    return answer.bands[quantity].around(answer, quantity) if quantity in answer.bands else None
+
+
 @dataclass(frozen=True)
 class Comparison:
     """The sizes of a quantity in the S computed frames of an answer and in truth, and its errors, each [S]."""
@@ -61,6 +70,8 @@ def compared(answer: Answer, truth: Trajectory) -> dict[str, Comparison]:
     true = truth_in_place(answer, truth, list(answer.frames))
     result = {}
     for quantity, values in VALUES.items():
+        if quantity == "reaction" and answer.info is not None and answer.info.corners_only:
+            continue
         try:
             ours, theirs = (values(one)[answer.computed] for one in (answer, true))
         except ConfigError:  # a quantity that this scene has not

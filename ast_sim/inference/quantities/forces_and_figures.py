@@ -18,13 +18,18 @@ from ast_sim.inference.quantities.frames_of_answers import time_of
 from ast_sim.mechanics.driven import Driven
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean
 from ast_sim.named_field import REACTION
-from ast_sim.number_arrays import three_numbers
-from ast_sim.support.errors import AstSimError, ConfigError, SimulationError, warn
+from ast_sim.number_arrays import plain_array, three_numbers
+from ast_sim.support.errors import AstSimError, ConfigError, SimulationError, counted, warn
 from ast_sim.view import sweep_files
 from ast_sim.view.files import make_folder
 
 if TYPE_CHECKING:
     from ast_sim.inference.answer import Answer
+
+
+STIFFER = (
+    "the run learned from elements of a higher order by their corners only (--corners, corners=True), which are stiffer"
+)
 
 
 class BodyForce(NamedTuple):
@@ -45,11 +50,63 @@ class BodyForce(NamedTuple):
     torque: np.ndarray
 
 
-def force_on_driven(answer: Answer) -> np.ndarray:
-    """[S, 3]: the force in newton on the prescribed nodes `answer.driven`; errors as in `Answer.reaction`."""
-    if answer.info is None or answer.driven is None:
+def force_on(answer: Answer, nodes: np.ndarray | Sequence[int] | None) -> np.ndarray:
+    """[S, 3]: the force in newton on prescribed nodes, by default `answer.driven`; errors as in `Answer.reaction`."""
+    if answer.info is None or (nodes is None and answer.driven is None):
         raise ConfigError(f"{answer.name} has no reaction: no prescribed node moves, or the answer is of no run")
-    return _newton(answer, answer.driven).sum(axis=1)
+    _tell_if_stiffer(answer)
+    if nodes is None:
+        assert answer.driven is not None
+        return _newton(answer, answer.driven).sum(axis=1)
+    chosen = _prescribed(answer, nodes)
+    bodies = np.unique(answer.scene.body[chosen]).tolist()
+    parts = [_on_body(answer, body, chosen & (answer.scene.body == body)) for body in bodies]
+    return np.sum([shares.sum(axis=1) for shares in parts], axis=0)
+
+
+def _tell_if_stiffer(answer: Answer) -> None:
+    if answer.info is not None and answer.info.corners_only:
+        warn(f"the force is not the one of the simulations: {STIFFER}. Convert them with all nodes of their elements")
+
+
+def _prescribed(answer: Answer, nodes: np.ndarray | Sequence[int]) -> np.ndarray:
+    """[N] bool: nodes that are given as such, or by their numbers; raise ConfigError unless all are prescribed."""
+    scene = answer.scene
+    given = plain_array(answer.name, "nodes", nodes)
+    wrong_mask = given.dtype == bool and given.shape != (scene.num_nodes,)
+    if wrong_mask or given.ndim != 1 or given.dtype.kind not in "biu":
+        raise ConfigError(
+            f"{answer.name}: nodes holds {given.dtype} in the shape {list(given.shape)}; must be [{scene.num_nodes}]"
+            " bool, or numbers of nodes"
+        )
+    numbers = np.flatnonzero(given) if given.dtype == bool else given
+    outside = (numbers < 0) | (numbers >= scene.num_nodes)
+    if outside.any() or not len(numbers):
+        told = f"there is no node {numbers[outside][0]}" if len(numbers) else "nodes names none"
+        raise ConfigError(f"{answer.name}: {told}; the scene has {counted(scene.num_nodes, 'node')}")
+    free = np.unique(numbers[~scene.prescribed[numbers]])
+    if len(free):
+        are = counted(len(free), "node of the wanted force is", "nodes of the wanted force are")
+        raise ConfigError(
+            f"{answer.name}: {are} free, the first is node {free[0]}: nothing from outside acts on free nodes. Name"
+            f" some of the {counted(int(scene.prescribed.sum()), 'prescribed node')} (scene.prescribed)"
+        )
+    chosen = np.zeros(scene.num_nodes, bool)
+    chosen[numbers] = True
+    return chosen
+
+
+def _on_body(answer: Answer, body: int, nodes: np.ndarray) -> np.ndarray:
+    """[S, N, 3]: the shares of prescribed nodes [N] bool of a body in the force on them, in newton."""
+    own = answer.scene.prescribed & (answer.scene.body == body)
+    left_out = int(own.sum() - nodes.sum())
+    if left_out and body in answer.scene.rigid_bodies and REACTION not in answer.fields:
+        are = counted(left_out, "node", "nodes")
+        raise ConfigError(
+            f"{answer.name}: body {body} is rigid, so positions show the force on all of it alone: {are} of"
+            f" {own.sum():,} left out; name all of them, or predict reactions (state=['reaction'])"
+        )
+    return _newton(answer, Driven(body, nodes, answer.position[:, nodes].astype(np.float64)))
 
 
 def forces_on_bodies(answer: Answer) -> list[BodyForce]:
@@ -58,12 +115,12 @@ def forces_on_bodies(answer: Answer) -> list[BodyForce]:
     scene = answer.scene
     if answer.info is None:
         raise ConfigError(f"{answer.name} has no reaction: the answer is of no run")
+    _tell_if_stiffer(answer)
     metres = LENGTH_UNITS[answer.info.length_unit]
     rows = []
     for body in np.unique(scene.body[scene.prescribed]).tolist():
         own = scene.body == body
-        nodes = scene.prescribed & own
-        shares = _newton(answer, Driven(body, nodes, answer.position[:, nodes].astype(np.float64)))
+        shares = _on_body(answer, body, scene.prescribed & own)
         position = answer.position.astype(np.float64)
         arms = metres * (position - position[:, own].mean(axis=1, keepdims=True))
         torques = np.cross(arms, shares).sum(axis=1)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import KDTree
 
-from ast_sim.element_topology import FACE_TRIANGLES, LOCAL_FACES, equal_rows, triangle_sides
+from ast_sim.element_topology import FACE_TRIANGLES, LOCAL_FACES, equal_rows, folded_elements, triangle_sides
 from ast_sim.mechanics.contact_and_friction import load_ipctk
 from ast_sim.number_arrays import connected_parts, point
 from ast_sim.simulate.shapes.cad.surface_mend import TriangleSurface, solids_of
@@ -30,9 +30,9 @@ def check_mesh(position: np.ndarray, elements: np.ndarray, name: str, smallest_a
 
     Raises:
         BadMesh: the text names the part, what is wrong and where: no tetrahedra, too many nodes, numbers that are not
-            finite, two nodes at one place, elements that are inverted, flat or with a dihedral angle below
-            `smallest_angle` degrees, no volume, several pieces, or a surface that cuts itself. Angles and volumes are
-            measured between the corners.
+            finite, two nodes at one place, elements that are inverted, flat, lie on others or have a dihedral angle
+            below `smallest_angle` degrees, no volume, several pieces, or a surface that cuts itself. Angles and volumes
+            are measured between the corners.
     """
     if len(elements) == 0:
         raise BadMesh(f"{name}: it holds no tetrahedra")
@@ -53,6 +53,12 @@ def check_mesh(position: np.ndarray, elements: np.ndarray, name: str, smallest_a
         first = int(np.argmax(inverted))
         raise BadMesh(
             f"{name}: {_count(inverted, 'inverted tetrahedron', 'inverted tetrahedra')}: {_at(first, elements, centre)}"
+        )
+    folded = folded_elements(elements, inverted)
+    if len(folded):
+        raise BadMesh(
+            f"{name}: {counted(len(folded), 'tetrahedron', 'tetrahedra')} in a fold of the mesh, which lie on others:"
+            f" {_at(folded[0], elements, centre)}; mesh it again"
         )
     _check_volume(volume.sum(), diagonal, name)
     _check_pieces(_element_pieces(elements), centre, name, "not joined by a common face")

@@ -134,3 +134,23 @@ def test_an_assembly_needs_a_specification_and_only_it_has_one(tmp_path, capsys)
     assert "assembly needs a specification" in capsys.readouterr().err
     assert main(["generate", "abcd", "SPEC.toml", *out]) == 2
     assert "abcd has no option spec; these families have it: assembly" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize("part", ["block", "punch"])
+def test_a_mesh_that_folds_over_itself_is_no_part(tmp_path, capsys, part, order):
+    """An inner node lies beyond a face of its star. Readers turn elements over, so that all have a volume; the surface
+    is whole. A rigid part is refused, too."""
+    path = write_assembly(tmp_path, SPEC.replace("order = 1", f"order = {order}"))
+    low, high = {"block": ((0, 0, 0), (10, 10, 5)), "punch": ((3, 3, 5.2), (7, 7, 8))}[part]
+    points, elements = box(low, high, (4, 4, 4))
+    inner = np.argmin(np.linalg.norm(points - (np.array(low) + high) / 2, axis=1))
+    points[inner, :2] += 0.3 * (np.array(high) - low)[:2]
+    corners = points[elements]
+    assert 0 < (np.linalg.det(corners[:, 1:] - corners[:, :1]) < 0).sum() <= 12
+    meshio.Mesh(points, {"tetra": elements}).write(tmp_path / f"{part}.vtu")
+    out = tmp_path / "study.h5"
+    assert main(["generate", "assembly", str(path), "--out", str(out), "--count", "1", "--workers", "1"]) == 2
+    told = capsys.readouterr().err.splitlines()
+    line = rf"{part} \({part}.vtu\): \d+ tetrahedra in a fold of the mesh, .*: element \d+ .*; mesh it again"
+    assert re.search(line, told[-1]) and not out.exists(), told

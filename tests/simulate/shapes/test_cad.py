@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from ast_sim.simulate.shapes.cad import gmsh_process, grammar
+from ast_sim.simulate.shapes.mesh import second_order
 from ast_sim.simulate.shapes.mesh_check import BadMesh, check_mesh
 from ast_sim.simulate.shapes.part_source import GrammarParts, StructuredParts, meshed_part, part_source
 from ast_sim.simulate.shapes.parts import rectilinear, volumes
@@ -183,6 +184,18 @@ def test_quadratic_tetrahedra_keep_their_corners(tmp_path):
     meshio.write(tmp_path / "quadratic.vtu", mesh)
     part = meshed_part(tmp_path / "quadratic.vtu")
     assert len(part.position) == 27 and np.allclose(part.position * np.sqrt(3), position)
+
+
+@pytest.mark.parametrize("second", [False, True])
+def test_a_mesh_file_that_folds_over_itself_is_no_part(tmp_path, second):
+    position, elements = rectilinear([np.linspace(0, 1, 4)] * 3)
+    position[np.argmin(np.linalg.norm(position - 1 / 3, axis=1))] += [0.5, 0.05, 0.1]
+    mesh = {"tetra10" if second else "tetra": elements}
+    if second:
+        position, mesh["tetra10"] = second_order(position, elements)
+    meshio.write(tmp_path / "folded.vtu", meshio.Mesh(position, mesh))
+    with pytest.raises(BadMesh, match=r"folded.vtu: \d+ tetrahedra in a fold of the mesh, .* element .*mesh it again"):
+        part_source(tmp_path / "folded.vtu").check()
 
 
 def test_loose_faces_that_close_are_sewn_to_a_solid(tmp_path):

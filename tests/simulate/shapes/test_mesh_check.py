@@ -5,8 +5,10 @@ import re
 import numpy as np
 import pytest
 
+from ast_sim.element_topology import turned_over
+from ast_sim.simulate.shapes.mesh import second_order
 from ast_sim.simulate.shapes.mesh_check import BadMesh, boundary, check_mesh, check_surface, smallest_dihedral
-from ast_sim.simulate.shapes.parts import oriented, rectilinear
+from ast_sim.simulate.shapes.parts import oriented, rectilinear, volumes
 
 
 def block(cells: int = 2) -> tuple[np.ndarray, np.ndarray]:
@@ -111,6 +113,33 @@ def test_sharp_elements():
     assert "dihedral angle below 5 degrees" in text
     worst = int(np.argmin(smallest_dihedral(position, elements)))
     assert f"element {worst} " in text
+
+
+def folded(cells: int, out: float, second: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A cube with an inner node beyond the farthest face of the elements around it, by a share `out` of their size, all
+    of positive volume as readers give them; and which elements the move turns over."""
+    position, elements = block(cells)
+    centre = int(np.flatnonzero(np.isclose(position, 5 if cells % 2 == 0 else 10 / cells).all(axis=1))[0])
+    position[centre] += 10 / cells * np.array([1 + out, 0.1, 0.2])
+    wrong = volumes(position, elements) < 0
+    if second:
+        position, elements = second_order(position, elements)
+    return position, turned_over(elements, wrong), wrong
+
+
+@pytest.mark.parametrize("second", [False, True])
+@pytest.mark.parametrize(("cells", "out"), [(3, 0.1), (3, 0.5), (4, 0.3), (4, 0.9)])
+def test_a_mesh_that_folds_over_itself(cells, out, second):
+    """An inner node has gone through a face of its star. Each element has a positive volume, and the surface is whole:
+    only the sides of faces tell."""
+    position, elements, wrong = folded(cells, out, second)
+    assert (volumes(position, elements) > 0).all()
+    text = refusal(check_mesh, position, elements)
+    lie_on_others = int(re.search(r"(\d+) tetrahedra in a fold of the mesh", text)[1])
+    assert lie_on_others > wrong.sum() > 0
+    number = int(re.search(r"element (\d+) ", text)[1])
+    assert np.allclose(points_in(text)[0], position[elements[number]].mean(axis=0), rtol=1e-4)
+    assert text.endswith("mesh it again")
 
 
 def test_dihedral_angles_of_known_tetrahedra():
