@@ -215,7 +215,11 @@ class ClothFrames(Frames[DynamicRecord]):
 
     case: ClothCase
     solver: BackwardEuler
-    record_type = DynamicRecord
+
+    @property
+    def record_type(self) -> type[DynamicRecord]:
+        """See `Frames`."""
+        return DynamicRecord
 
     def __init__(self, case: ClothCase, settings: DynamicSettings | None) -> None:
         solver = BackwardEuler(case, settings)

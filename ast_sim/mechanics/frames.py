@@ -10,6 +10,7 @@ import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from time import process_time
 from typing import Generic, Protocol, TypedDict, TypeVar
 
@@ -121,13 +122,9 @@ class Frames(ABC, Generic[R]):
         contact: contact between the surfaces of the scene.
 
     Attributes:
-        record_type: type of the record of each frame.
         records: one record for each frame.
         arrays: the stored arrays by name: lists with one entry a frame.
-        driven: the nodes that the reaction is of.
     """
-
-    record_type: type[R]
 
     def __init__(self, case: Case, solver: Solver, contact: Contact) -> None:
         self.case = case
@@ -136,7 +133,20 @@ class Frames(ABC, Generic[R]):
         self.records: list[R] = []
         self.arrays: dict[str, list[np.ndarray]] = {}
         self._steps_before = 0
-        self.driven = Driven.of(case.scene, case.prescribed_position)
+
+    @property
+    @abstractmethod
+    def record_type(self) -> type[R]:
+        """The type of the record of each frame."""
+
+    @cached_property
+    def driven(self) -> Driven:
+        """The nodes that the reaction is of."""
+        return Driven.of(self.case.scene, self.motion())
+
+    def motion(self) -> np.ndarray:
+        """[S,N,3]: where the prescribed nodes are, as far as their motion must be known to tell what drives it."""
+        return self.case.prescribed_position
 
     @abstractmethod
     def next_frame(self) -> tuple[dict[str, np.ndarray], R]:

@@ -11,7 +11,6 @@ import numpy as np
 
 from ast_sim.mechanics.case import SolidCase
 from ast_sim.mechanics.contact_and_friction import Contact
-from ast_sim.mechanics.driven import Driven
 from ast_sim.mechanics.elements.neo_hookean import von_mises
 from ast_sim.mechanics.elements.second_order import deforming_body
 from ast_sim.mechanics.frames import MAX_FRAME_ITERATIONS, FrameRecord, Frames, GivenUp
@@ -143,7 +142,6 @@ class SolidFrames(Frames[SolidRecord]):
 
     case: SolidCase
     solver: QuasiStatic
-    record_type = SolidRecord
 
     def __init__(self, case: SolidCase, settings: SolverSettings | None, prepared: NewtonSteps | None = None) -> None:
         if case.hardening:
@@ -161,10 +159,17 @@ class SolidFrames(Frames[SolidRecord]):
         contact = Contact(rest, scene.surface(), scene.body, case.contact, ~scene.deforming_nodes)
         solver = QuasiStatic(self._elasticity, contact, scene.prescribed, rest, settings, system)
         super().__init__(case, solver, contact)
-        self.driven = Driven.of(scene, case.on_legs())  # frames may not show how far nodes turn, nor which way
         self._reactions = np.zeros_like(rest)
-        self.record_type = SolidRecord if self.driven.axis is None else TurnedRecord
         self._work = 0.0
+
+    @property
+    def record_type(self) -> type[SolidRecord]:
+        """See `Frames`."""
+        return SolidRecord if self.driven.axis is None else TurnedRecord
+
+    def motion(self) -> np.ndarray:
+        """See `Frames`: frames may not show how far nodes turn, nor which way."""
+        return self.case.on_legs()
 
     def next_frame(self) -> tuple[dict[str, np.ndarray], SolidRecord]:
         """See `Frames`."""

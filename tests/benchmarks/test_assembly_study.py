@@ -1,7 +1,7 @@
 """The study of own assemblies, from end to end on a block that a punch presses."""
 
 import json
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import pytest
 from simulate.own_assembly.assemblies import write_assembly
@@ -39,14 +39,6 @@ def test_a_product_is_simulated_learned_and_measured(small):
     error = sum(abs(curve.reaction / curve.true_reaction - 1) for curve in one.curves) / 2
     assert f"{100 * error:.2g} %, median" in together and ("questions" in alone or "never" in alone)
     assert json.loads((small / "data" / "run_later_2" / "run.json").read_text())["start"]["step"] in (2, 4)
-
-
-def test_the_page_is_the_one_that_the_results_make():
-    results = json.loads(assembly.RESULTS.read_text())
-    assert assembly.page(results) + "\n" == assembly.PAGE.read_text()
-    for values in results.values():
-        deepest = assembly.MeasuredProduct.from_json(values).deepest
-        assert json.loads(json.dumps(asdict(deepest))) == values["deepest"]
 
 
 def test_an_unknown_row_is_named(capsys):

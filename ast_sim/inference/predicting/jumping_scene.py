@@ -69,7 +69,7 @@ class JumpingFrame:
     @property
     def position(self) -> Tensor:
         """The positions after all that was computed so far."""
-        return [*self.after_calls, *self.after_newton_steps][-1] if self.solution is None else self.solution
+        return (self.after_newton_steps or self.after_calls)[-1] if self.solution is None else self.solution
 
     def begin(self) -> None:
         """Make the start, when the source is predicted."""

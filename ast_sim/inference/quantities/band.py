@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ast_sim.inference.quantities.forces_and_figures import STIFFER
+from ast_sim.inference.quantities.forces_and_figures import STIFFER, is_stiffer
 from ast_sim.inference.quantities.relative_errors import require_quantity, truth_in_place
 from ast_sim.number_arrays import percent
 from ast_sim.scene import Trajectory
@@ -46,7 +46,7 @@ class Band:
 def band_of(answer: Answer, quantity: str) -> np.ndarray | None:
     """See `Answer.band`."""
     require_quantity(quantity, answer.bands)
-    if quantity == "reaction" and answer.info is not None and answer.info.corners_only:
+    if quantity == "reaction" and is_stiffer(answer):
         raise ConfigError(f"{answer.name}: no force is promised: {STIFFER}")
     return answer.bands[quantity].around(answer, quantity) if quantity in answer.bands else None
 
@@ -70,7 +70,7 @@ def compared(answer: Answer, truth: Trajectory) -> dict[str, Comparison]:
     true = truth_in_place(answer, truth, list(answer.frames))
     result = {}
     for quantity, values in VALUES.items():
-        if quantity == "reaction" and answer.info is not None and answer.info.corners_only:
+        if quantity == "reaction" and is_stiffer(answer):
             continue
         try:
             ours, theirs = (values(one)[answer.computed] for one in (answer, true))

@@ -64,8 +64,13 @@ def force_on(answer: Answer, nodes: np.ndarray | Sequence[int] | None) -> np.nda
     return np.sum([shares.sum(axis=1) for shares in parts], axis=0)
 
 
+def is_stiffer(answer: Answer) -> bool:
+    """Whether no force of an answer is promised; see `STIFFER`."""
+    return answer.info is not None and answer.info.corners_only
+
+
 def _tell_if_stiffer(answer: Answer) -> None:
-    if answer.info is not None and answer.info.corners_only:
+    if is_stiffer(answer):
         warn(f"the force is not the one of the simulations: {STIFFER}. Convert them with all nodes of their elements")
 
 
