@@ -136,7 +136,10 @@ def test_no_band_where_nothing_is_known(calibrated):
     assert set(result.bands(answer, run.effort, ())) == {"displacement", "stress"}
     assert not result.bands(answer, run.effort, ("it is large",))  # which is told already
     for other, words in (
-        (replace(result, efforts=(Effort(3),)), "no band: the run was calibrated with 3 corrections"),
+        (
+            replace(result, efforts=(Effort(3),)),
+            r"no band: the run was calibrated with 1 effort \(run.calibration.efforts\), but not with 0 corrections",
+        ),
         (
             replace(result, quantiles={"displacement": (np.inf,)}),
             "no band: too many calibration scenes failed with 0 corrections",

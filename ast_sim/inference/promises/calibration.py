@@ -163,7 +163,8 @@ class Calibration:
             return {}
         why = self.unlike(answer.scene, ())
         if effort not in self.efforts:
-            why = f"the run was calibrated with {'; '.join(one.text for one in self.efforts)}"
+            known = counted(len(self.efforts), "effort")
+            why = f"the run was calibrated with {known} (run.calibration.efforts), but not with {effort.text}"
         elif math.isinf(self._widths(effort)[DISPLACEMENT]):
             why = f"too many calibration scenes failed with {effort.text}"
         if why:
