@@ -143,14 +143,34 @@ _CHECKS: dict[str, Callable[[Path], None]] = {
 
 
 def _plain_med(path: Path) -> bytes:
-    """A MED file without the families that have no groups: meshio looks for their names."""
+    """A MED file without the families that have no groups, for whose names meshio looks; the others have letters in
+    place of bytes."""
     copy = io.BytesIO(path.read_bytes())
-    with contextlib.suppress(OSError, KeyError, AttributeError), h5py.File(copy, "r+") as file:
+    with contextlib.suppress(OSError, KeyError, AttributeError, TypeError), h5py.File(copy, "r+") as file:
         families: Any = file["FAS"]
         for place in [one[part] for one in families.values() for part in ("ELEME", "NOEUD") if part in one]:
-            for name in [name for name, family in place.items() if "GRO" not in family]:
-                del place[name]
+            for name, family in list(place.items()):
+                if "GRO" in family:
+                    _spell(family["GRO"])
+                else:
+                    del place[name]
     return copy.getvalue()
+
+
+def _spell(groups: Any) -> None:
+    """Store the letters of the names of MED groups, which are bytes of UTF-8, or of Latin-1 in old files: meshio takes
+    each byte for a letter, and fails on those that are not ASCII."""
+    names = [_letters(row.tobytes()).rstrip("\0 ") for row in groups["NOM"][()]]
+    width = max(1, *map(len, names))
+    del groups["NOM"]
+    groups.create_dataset("NOM", data=[[ord(letter) for letter in name.ljust(width)] for name in names])
+
+
+def _letters(name: bytes) -> str:
+    try:
+        return name.decode("utf-8")
+    except UnicodeDecodeError:
+        return name.decode("latin-1")
 
 
 _PLAIN: dict[str, Callable[[Path], bytes]] = {
