@@ -12,6 +12,8 @@ import numpy as np
 
 from ast_sim.element_topology import is_closed
 from ast_sim.importers.decks.deck_mesh import deck_mesh
+from ast_sim.importers.formats.exodus.exodus_files import exodus_facts
+from ast_sim.importers.formats.exodus.exodus_pieces import is_first_piece, is_piece, piece_frames
 from ast_sim.importers.formats.source_mesh import CellBlock, SourceMesh
 from ast_sim.importers.formats.stl_file import BadSurface, read_stl
 from ast_sim.importers.formats.text_meshes import reader_of
@@ -25,6 +27,9 @@ from ast_sim.support.errors import DatasetError
 # Formats whose files hold all frames of a simulation.
 WITH_FRAMES = (".vtkhdf", ".frd", ".e", ".ex2", ".exo", ".exoii", ".exii")
 
+# Exodus files that hold a mesh by their names; some programs write results into them.
+MESHES_OF_EXODUS = (".g", ".gen")
+
 # Formats in which each frame is a file of its own; files of the last ones may hold all frames.
 XDMF = (".xdmf", ".xmf")
 ONE_FRAME = (".vtu", ".pvtu", ".vtk", ".vtp", ".pvtp", ".vts", ".pvts", *BLOCKS, *XDMF, ".msh")
@@ -32,15 +37,18 @@ ONE_FRAME = (".vtu", ".pvtu", ".vtk", ".vtp", ".pvtp", ".vts", ".pvts", *BLOCKS,
 
 def is_of_known_kind(path: Path) -> bool:
     """Whether the kind of a file, by its name, is one that `frames_in` reads."""
-    return path.suffix.lower() in (*ENDINGS, ".inp", ".stl", *BY_MESHIO) or is_dyna(path)
+    return path.suffix.lower() in (*ENDINGS, ".inp", ".stl", *BY_MESHIO) or is_dyna(path) or is_piece(path)
 
 
 def holds_frames(path: Path) -> bool:
-    """Whether a file holds all frames of a simulation."""
+    """Whether a file holds all frames of a simulation. The first of the pieces of a parallel run stands for all."""
     ending = path.suffix.lower()
     if ending in XDMF:
         return re.search(rb"GridType\s*=\s*[\"']Collection", path.read_bytes()) is not None
-    return ending in WITH_FRAMES or is_dyna(path) or (ending == ".msh" and has_steps(path))
+    if ending in MESHES_OF_EXODUS:
+        facts = exodus_facts(path)
+        return facts is not None and facts.steps > 0
+    return ending in WITH_FRAMES or is_dyna(path) or is_first_piece(path) or (ending == ".msh" and has_steps(path))
 
 
 def only_frame(path: Path) -> SourceMesh:
@@ -81,6 +89,8 @@ def frames_in(path: Path) -> Iterator[SourceMesh]:
                 raise DatasetError(str(error).replace(str(link), str(path))) from error
     elif ending in ENDINGS or is_dyna(path):
         yield from vtk_frames(path)
+    elif is_piece(path):
+        yield from piece_frames(path, vtk_frames)
     elif ending == ".inp" or (ending == ".msh" and _beginning(path).startswith(b"*")):  # as cgx of CalculiX calls it
         yield deck_mesh(path)
     elif ending == ".msh" and re.search(rb"(?m)^\$(MeshFormat|NOD)\s*$", _beginning(path)):
