@@ -11,6 +11,9 @@ import numpy as np
 # The blocks in which VTK keeps the sets of Exodus.
 _SETS = {"Node Sets": "nodes", "Side Sets": "sides"}
 
+_TRIANGLE = 5  # VTK's types of cells
+_POLYGON = 7
+
 
 class Refused(Exception):
     """VTK cannot read a file. The text says why."""
@@ -122,8 +125,58 @@ def arrays_of(block: Block) -> dict[str, np.ndarray]:
                 names = [array.GetComponentName(c) or "" for c in range(array.GetNumberOfComponents())]
                 if any(names):
                     arrays[f"{place}-columns {array.GetName()}{again}"] = np.array(names, "S")
+    arrays = _with_cut_polygons(arrays)
     ids = _numpy(data.GetPointData().GetGlobalIds())
     return arrays if ids is None else {**arrays, "global": ids}
+
+
+def _with_cut_polygons(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The arrays of a mesh whose polygons of more than four corners are cut into triangles, which stand behind all
+    other cells."""
+    long = (arrays["types"] == _POLYGON) & (np.diff(arrays["offsets"]) > 4)
+    if not long.any():
+        return arrays
+    triangles, of = _triangles(arrays, np.flatnonzero(long))
+    rows = np.concatenate([np.flatnonzero(~long), of])
+    kept = np.repeat(~long, np.diff(arrays["offsets"]))
+    sizes = np.concatenate([np.diff(arrays["offsets"])[~long], np.full(len(of), 3)])
+    return {
+        **arrays,
+        **{name: values[rows] for name, values in arrays.items() if name.startswith("cell ")},
+        "types": np.concatenate([arrays["types"][~long], np.full(len(of), _TRIANGLE, np.uint8)]),
+        "offsets": np.concatenate([[0], np.cumsum(sizes)]),
+        "connectivity": np.concatenate([arrays["connectivity"][kept], triangles.ravel()]),
+        "more": arrays["more"] + len(of) - long.sum(),
+    }
+
+
+def _triangles(arrays: dict[str, np.ndarray], rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """[t, 3], [t]: the triangles into which VTK cuts polygons, also such as are not convex, and the row of each."""
+    from vtkmodules.util.numpy_support import numpy_to_vtk
+    from vtkmodules.vtkCommonCore import vtkPoints
+    from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
+    from vtkmodules.vtkFiltersCore import vtkTriangleFilter
+
+    points = vtkPoints()
+    points.SetData(numpy_to_vtk(np.ascontiguousarray(arrays["points"], float), deep=True))
+    cells = vtkCellArray()
+    for row in rows:
+        corners = arrays["connectivity"][arrays["offsets"][row] : arrays["offsets"][row + 1]]
+        cells.InsertNextCell(len(corners), corners.tolist())
+    surface = vtkPolyData()
+    surface.SetPoints(points)
+    surface.SetPolys(cells)
+    numbers = numpy_to_vtk(rows, deep=True)
+    numbers.SetName("row")
+    surface.GetCellData().AddArray(numbers)
+    cut = vtkTriangleFilter()
+    cut.SetInputData(surface)
+    cut.Update()
+    made = cut.GetOutput()
+    of = _numpy(made.GetCellData().GetArray("row")).astype(np.int64)
+    if len(np.unique(of)) < len(rows):
+        raise Refused("has a polygon that cannot be cut into triangles: write triangles")
+    return _numpy(made.GetPolys().GetConnectivityArray()).astype(np.int64).reshape(-1, 3), of
 
 
 def of_used_points(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -33,7 +33,7 @@ from ast_sim.importers.formats.exodus.exodus_groups import groups_in
 from ast_sim.importers.formats.exodus.unwritten import with_nan, written_time
 from ast_sim.importers.formats.frd_given_up import is_left_out
 from ast_sim.importers.formats.frd_results import read_frd_headers
-from ast_sim.importers.formats.pieces_apart import are_unlike, copy_of, read_apart, with_pieces_only
+from ast_sim.importers.formats.pieces_apart import are_unlike, copy_of, files_apart, read_apart, with_pieces_only
 from ast_sim.importers.formats.source_mesh import SourceMesh
 from ast_sim.importers.formats.together import labels_of, together
 from ast_sim.importers.formats.vtk_cells import blocks_of
@@ -83,6 +83,16 @@ def vtk_frames(path: Path) -> Iterator[SourceMesh]:
             copies = [stack.enter_context(copy_of(path, with_pieces_only(path, kept))) for kept in apart]
             for parts in zip(*map(vtk_frames, copies), strict=True):
                 yield replace(together(parts), path=path, piece_names=())
+        return
+    files = files_apart(path) if path.suffix.lower() in (".pvtu", ".pvtp") else []
+    if files:
+        readings = [vtk_frames(path.parent / file) for file in files]
+        for parts in zip(*readings, strict=True):
+            named = [
+                replace(part, pieces=None, piece_names=(name,))
+                for part, name in zip(parts, labels_of(files), strict=True)
+            ]
+            yield replace(together(named), path=path)
         return
     of_steps = declared_in_vtkhdf(path) if path.suffix.lower() == ".vtkhdf" else []
     step, steps = 0, 1
