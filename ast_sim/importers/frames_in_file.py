@@ -12,10 +12,13 @@ import numpy as np
 
 from ast_sim.element_topology import is_closed
 from ast_sim.importers.decks.deck_mesh import deck_mesh
+from ast_sim.importers.formats.exodus.exodus_files import exodus_facts
+from ast_sim.importers.formats.exodus.exodus_pieces import is_first_piece, is_piece, piece_frames
+from ast_sim.importers.formats.pieces_apart import copy_of
 from ast_sim.importers.formats.source_mesh import CellBlock, SourceMesh
 from ast_sim.importers.formats.stl_file import BadSurface, read_stl
 from ast_sim.importers.formats.text_meshes import reader_of
-from ast_sim.importers.formats.vtk_files import BLOCKS, ENDINGS, is_dyna, vtk_frames
+from ast_sim.importers.formats.vtk_files import BLOCKS, ENDINGS, XML, is_dyna, vtk_frames
 from ast_sim.importers.meshio_files import BY_MESHIO, by_meshio
 from ast_sim.importers.msh.gmsh_fields import has_steps
 from ast_sim.importers.msh.gmsh_files import gmsh_frames
@@ -25,22 +28,33 @@ from ast_sim.support.errors import DatasetError
 # Formats whose files hold all frames of a simulation.
 WITH_FRAMES = (".vtkhdf", ".frd", ".e", ".ex2", ".exo", ".exoii", ".exii")
 
+# Exodus files that hold a mesh by their names; some programs write results into them.
+MESHES_OF_EXODUS = (".g", ".gen")
+
 # Formats in which each frame is a file of its own; files of the last ones may hold all frames.
 XDMF = (".xdmf", ".xmf")
 ONE_FRAME = (".vtu", ".pvtu", ".vtk", ".vtp", ".pvtp", ".vts", ".pvts", *BLOCKS, *XDMF, ".msh")
 
+# The mark of UTF-8, with which some editors of Windows begin a text. The readers of some formats know it; TetGen's
+# second file stands beside the first one.
+_MARK = b"\xef\xbb\xbf"
+_WITH_MARK = (".inp", ".stl", ".ele", ".node", *XML, *XDMF)
+
 
 def is_of_known_kind(path: Path) -> bool:
     """Whether the kind of a file, by its name, is one that `frames_in` reads."""
-    return path.suffix.lower() in (*ENDINGS, ".inp", ".stl", *BY_MESHIO) or is_dyna(path)
+    return path.suffix.lower() in (*ENDINGS, ".inp", ".stl", *BY_MESHIO) or is_dyna(path) or is_piece(path)
 
 
 def holds_frames(path: Path) -> bool:
-    """Whether a file holds all frames of a simulation."""
+    """Whether a file holds all frames of a simulation. The first of the pieces of a parallel run stands for all."""
     ending = path.suffix.lower()
     if ending in XDMF:
         return re.search(rb"GridType\s*=\s*[\"']Collection", path.read_bytes()) is not None
-    return ending in WITH_FRAMES or is_dyna(path) or (ending == ".msh" and has_steps(path))
+    if ending in MESHES_OF_EXODUS:
+        facts = exodus_facts(path)
+        return facts is not None and facts.steps > 0
+    return ending in WITH_FRAMES or is_dyna(path) or is_first_piece(path) or (ending == ".msh" and has_steps(path))
 
 
 def only_frame(path: Path) -> SourceMesh:
@@ -70,18 +84,22 @@ def frames_in(path: Path) -> Iterator[SourceMesh]:
         what = "is a folder: name a file in it" if path.is_dir() else "there is no such file"
         raise DatasetError(f"{path}: {what}")
     ending = path.suffix.lower()
+    is_deck = ending == ".inp" or (ending == ".msh" and _beginning(path).startswith(b"*"))  # cgx calls a deck so
+    if not is_deck and ending not in _WITH_MARK and _is_marked(path):
+        with copy_of(path, path.read_bytes()[len(_MARK) :]) as copy:
+            yield from _named(path, copy, frames_in(copy))
+        return
     true = _ending_of_vtk(path) if ending in (".vtk", ".vtu", ".vtp", ".vts") else ending
     if true != ending:
         with tempfile.TemporaryDirectory() as folder:
             link = Path(folder) / (path.stem + true)
             link.symlink_to(path.resolve())
-            try:
-                yield from (replace(frame, path=path) for frame in vtk_frames(link))
-            except DatasetError as error:
-                raise DatasetError(str(error).replace(str(link), str(path))) from error
+            yield from _named(path, link, vtk_frames(link))
     elif ending in ENDINGS or is_dyna(path):
         yield from vtk_frames(path)
-    elif ending == ".inp" or (ending == ".msh" and _beginning(path).startswith(b"*")):  # as cgx of CalculiX calls it
+    elif is_piece(path):
+        yield from piece_frames(path, vtk_frames)
+    elif is_deck:
         yield deck_mesh(path)
     elif ending == ".msh" and re.search(rb"(?m)^\$(MeshFormat|NOD)\s*$", _beginning(path)):
         yield from gmsh_frames(path)
@@ -104,9 +122,23 @@ def _ending_of_vtk(path: Path) -> str:
     return ".vtk" if head.startswith(b"# vtk DataFile") else path.suffix.lower()
 
 
+def _named(path: Path, read: Path, frames: Iterator[SourceMesh]) -> Iterator[SourceMesh]:
+    """Frames and errors that name the file, though they come from a link to it or from a copy."""
+    try:
+        yield from (replace(frame, path=path) for frame in frames)
+    except DatasetError as error:
+        raise DatasetError(str(error).replace(str(read), str(path))) from error
+
+
 def _beginning(path: Path) -> bytes:
+    """The first bytes of a file, behind the mark of UTF-8 if it has one."""
     with path.open("rb") as file:
-        return file.read(1 << 16)
+        return file.read(1 << 16).removeprefix(_MARK)
+
+
+def _is_marked(path: Path) -> bool:
+    with path.open("rb") as file:
+        return file.read(len(_MARK)) == _MARK
 
 
 def _surface(path: Path) -> SourceMesh:

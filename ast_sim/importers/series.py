@@ -25,7 +25,7 @@ from ast_sim.importers.solids.kept_fields import KeptFields
 from ast_sim.importers.solids.kept_frames import KeptFrames
 from ast_sim.importers.solids.positions import (
     far_origin,
-    fields_of_components,
+    fields_of_vector,
     rest_and_position,
     told_of_components,
     warn_of_rounding,
@@ -198,7 +198,7 @@ def _read_frames(
             notes.append(
                 f"the elements of {frame.path.name} stand in another order: they are reordered as in the first"
             )
-        stitching.look(frame, used_fields, names.displacement or "displacement")
+        stitching.look(frame, used_fields, fields_of_vector(names.displacement, frame.point_fields))
         constant.look(frame, cells)
         kept.times.append(frame.time)
         kept.points.append(frame.points)
@@ -232,7 +232,7 @@ def _put_in_order_of_time(source: Path, kept: KeptFrames, further: KeptFields) -
         further.reorder(by_time)
         return [*notes, *said]
     if times is None:
-        return [*notes, *kept.doubts()]
+        return [*notes, *kept.doubts(), *kept.doubts_of_end()]
     notes = [*notes, *doubts_of_times(source, times, kept.times)]
     kept.times = list(times)
     return notes
@@ -256,10 +256,9 @@ def frames(source: Path) -> Iterator[SourceMesh]:
 
 def _displacement(frame: SourceMesh, names: FieldNames) -> np.ndarray | None:
     """The displacements of the points [n, 3]; None if the file holds none."""
-    parts = fields_of_components(names.displacement, frame.point_fields)
-    if names.displacement is None and "displacement" not in frame.point_fields and not parts:
+    fields = fields_of_vector(names.displacement, frame.point_fields)
+    if not fields:
         return None
-    fields = parts or [names.displacement or "displacement"]
     value = np.concatenate([raw_field(frame, "point", one) for one in fields], axis=1)
     if value.shape[1] not in (2, 3):
         held = counted(value.shape[1], "component")

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ast_sim.importers.formats.source_mesh import SourceMesh
+from ast_sim.importers.formats.source_mesh import SourceMesh, known_as, without_separator
 from ast_sim.importers.frames_in_file import XDMF
 from ast_sim.importers.mesh_file import raw_field
 from ast_sim.support.errors import ConfigError, DatasetError, counted
@@ -24,6 +24,7 @@ _ORDERS = {
     6: _NORMAL_FIRST,
     9: ("xx", "xy", "xz", "yx", "yy", "yz", "zx", "zy", "zz"),
 }
+_TENSORS = {(count,) for count in _ORDERS}
 # A tensor of plane stress, as arrays of two rows and two columns have it.
 _IN_THE_PLANE = ("xx", "xy", "yx", "yy")
 
@@ -35,7 +36,6 @@ _AXES = {"1": "x", "2": "y", "3": "z", **{axis: axis for axis in "xyz"}}
 # What a name ends with that is a component: stress_xy, S11, sigma-xz, Stress(y,y), and, for a normal stress, SX.
 _BETWEEN = r"(.*?)[ _.:(\[-]*"
 _TWO_AXES = re.compile(_BETWEEN + r"([xyz123])[ ,_-]?([xyz123])[)\]]?", re.IGNORECASE)
-_BARE = re.compile(r"[ _.:(\[-]+$")
 _ONE_AXIS = re.compile(_BETWEEN + r"([xyz])[)\]]?", re.IGNORECASE)
 
 
@@ -143,6 +143,9 @@ def of_components(frame: SourceMesh, name: str, given: tuple[str, ...]) -> Sourc
     """
     if name in frame.point_fields or name in frame.cell_fields:
         return frame
+    whole = _under_its_name(frame, name)
+    if whole is not None:
+        return whole
     at_points = {field: np.asarray(values) for field, values in frame.point_fields.items()}
     of_cells = {field: np.concatenate(parts) for field, parts in frame.cell_fields.items() if parts}
     both = [_held(frame.path, name, fields) for fields in (at_points, of_cells)]
@@ -168,13 +171,24 @@ def of_components(frame: SourceMesh, name: str, given: tuple[str, ...]) -> Sourc
     return replace(frame, cell_fields={**frame.cell_fields, name: parts})
 
 
+def _under_its_name(frame: SourceMesh, name: str) -> SourceMesh | None:
+    """A frame that has a whole tensor under this name as well, if it has it as `name_`; else None."""
+    known = known_as(name, [*frame.point_fields, *frame.cell_fields])
+    columns = {**frame.columns, name: frame.columns.get(known, ())}
+    if known in frame.point_fields and frame.point_fields[known].shape[1:] in _TENSORS:
+        return replace(frame, point_fields={**frame.point_fields, name: frame.point_fields[known]}, columns=columns)
+    if known in frame.cell_fields and {part.shape[1:] for part in frame.cell_fields[known]} <= _TENSORS:
+        return replace(frame, cell_fields={**frame.cell_fields, name: frame.cell_fields[known]}, columns=columns)
+    return None
+
+
 def _held(path: Path, name: str, fields: dict[str, np.ndarray]) -> dict[str, tuple[str, np.ndarray]]:
     """The field and the values of each component of a stress; xy also stands for yx. Two or three columns are a row
     of the tensor: VTK makes `stress_x` of the fields stress_xx, stress_xy and stress_xz of Exodus."""
     held: dict[str, tuple[str, np.ndarray]] = {}
     for field, values in fields.items():
         stem, component = _split(field)
-        if not component or stem.casefold() != _BARE.sub("", name).casefold() or values.dtype.kind not in "iufb":
+        if not component or stem.casefold() != without_separator(name).casefold() or values.dtype.kind not in "iufb":
             continue
         columns = values.reshape(len(values), -1)
         count = columns.shape[1]

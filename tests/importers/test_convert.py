@@ -377,7 +377,7 @@ WRONG = {
     "not finite": (
         frame(point={"displacement": np.full((8, 3), np.nan)}),
         {},
-        "position in frame 1 at node 0 is not finite",
+        "the displacement of frame 1 is no number at 8 nodes: was the run stopped",
     ),
 }
 

@@ -174,5 +174,5 @@ def test_elements_that_vtk_mistakes_are_refused_in_netcdf_4_as_well(tmp_path):
 
 def test_elements_of_exodus_that_vtk_does_not_know_are_named(tmp_path):
     exodus_of(tmp_path / "a.e", "BEX_HEX", 8)
-    with pytest.raises(DatasetError, match="a.e: cannot be read as a mesh: Unsupported element type: BEX_HEX"):
+    with pytest.raises(DatasetError, match="a.e: .*: VTK does not know its elements of the kind 'BEX_HEX'"):
         read_mesh(tmp_path / "a.e")

@@ -238,3 +238,67 @@ def test_a_legacy_file_that_is_cut_off_is_refused_or_told(tmp_path):
             np.testing.assert_allclose(frame.point_fields["u"][:, :2], CUBE.rest_position[:, :2])
     told = ["the file ends without a line end: is its last number cut off?"]
     assert notes == [[], *[told] * 5] and refused == 94  # without the line end, and without 1 to 4 letters of 1.000
+
+
+@pytest.mark.parametrize(
+    ("times", "told"),
+    [
+        (("0,0", "0,25", "0,5", "1,0"), "the frames stand in the order of the numbers in their names, read with their"),
+        (("0,00", "0,25", "0,50", "1,00"), ""),
+        (("0", "0,5", "0.75", "1e0"), ""),
+    ],
+)
+def test_numbers_in_names_may_have_a_decimal_comma(tmp_path, times, told):
+    """As programs write them under Windows in many countries: 0,25 comes before 0,5."""
+    for frame, time in enumerate(times):
+        grid(pressed(frame)).save(tmp_path / f"result_{time}.vtu")
+    read = read_series(tmp_path, NAMES)
+    np.testing.assert_allclose(read.position[:, :, 2].max(axis=1), (1, 0.9, 0.8, 0.7), rtol=1e-6)
+    notes = read.attributes.get("notes", "")
+    assert told in notes and bool(told) == bool(notes)
+
+
+def test_files_that_a_list_names_with_decimal_commas_are_in_order(tmp_path):
+    for frame, time in enumerate(("0,0", "0,25", "0,5")):
+        grid(pressed(frame)).save(tmp_path / f"result_{time}.vtu")
+    listed = [
+        f'<DataSet timestep="{float(time.replace(",", "."))}" file="result_{time}.vtu"/>'
+        for time in ("0,0", "0,25", "0,5")
+    ]
+    (tmp_path / "all.pvd").write_text(
+        f'<VTKFile type="Collection"><Collection>{"".join(listed)}</Collection></VTKFile>'
+    )
+    assert "notes" not in read_series(tmp_path / "all.pvd", NAMES).attributes
+
+
+MARKED = {
+    "a.msh": "gmsh",
+    "b.msh": "gmsh22",
+    "a.mesh": None,
+    "a.bdf": None,
+    "a.avs": None,
+    "a.vtk": None,
+    "a.vtu": None,
+    "a.inp": None,
+}
+
+
+@pytest.mark.parametrize("name", MARKED)
+def test_texts_may_begin_with_the_mark_of_utf_8(tmp_path, name):
+    """Some editors of Windows put it there."""
+    options = {} if name in ("a.mesh", "a.bdf", "a.avs", "a.inp") else {"binary": False}
+    meshio.Mesh(CUBE.rest_position.astype(float), [("tetra", CUBE.elements)]).write(
+        tmp_path / name, MARKED[name], **options
+    )
+    plain = read_mesh(tmp_path / name)
+    (tmp_path / name).write_bytes(b"\xef\xbb\xbf" + (tmp_path / name).read_bytes())
+    marked = read_mesh(tmp_path / name)
+    assert marked.path == tmp_path / name
+    np.testing.assert_array_equal(marked.points, plain.points)
+    np.testing.assert_array_equal(marked.elements, plain.elements)
+
+
+def test_errors_of_a_marked_text_name_the_file(tmp_path):
+    (tmp_path / "a.msh").write_bytes(b"\xef\xbb\xbf$MeshFormat\n4.1 0 8\n$EndMeshFormat\n$Nodes\n1 2")
+    with pytest.raises(DatasetError, match=f"^{tmp_path / 'a.msh'}: "):
+        read_mesh(tmp_path / "a.msh")

@@ -8,6 +8,7 @@ import h5py
 import numpy as np
 import pytest
 import pyvista
+from blocks import block
 
 from ast_sim.importers.mesh_file import read_mesh
 from ast_sim.support.errors import DatasetError
@@ -276,6 +277,41 @@ def test_polygons_and_strips_of_vtk_are_cut_into_triangles(tmp_path, ending):
     assert (of_polygon.sum(), (~of_polygon).sum()) == (6, 6)
     assert areas[of_polygon].sum() == pytest.approx(5) and areas[~of_polygon].sum() == pytest.approx(3)
     assert "polygons and strips are cut into triangles: 10 more cells" in mesh.notes
+
+
+@pytest.mark.parametrize("ending", ["vtu", "vtk"])
+def test_polygons_of_an_unstructured_grid_are_cut_into_triangles(tmp_path, ending):
+    """Beside other cells, in any order; the values of a cell go to its triangles."""
+    points = np.array([*FORK, *(np.array(RING) + (0, 0, 3)), *(np.array(BENT) - (0, 0, 2))], float)
+    cells = [3, 8, 9, 10, 8, *range(8), 4, 13, 14, 15, 16, 5, 18, 19, 20, 21, 22, 4, 0, 1, 2, 3]
+    grid = pyvista.UnstructuredGrid(cells, [5, 7, 7, 7, 9], points)
+    grid.cell_data["E"] = [1.0, 2.0, 3.0, 4.0, 5.0]
+    grid.save(tmp_path / f"a.{ending}")
+    mesh = read_mesh(tmp_path / f"a.{ending}")
+    a, b, c = np.moveaxis(mesh.points[mesh.elements], 1, 0)
+    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+    of = mesh.fields["cell"]["E"]
+    assert [int((of == number).sum()) for number in range(1, 6)] == [1, 6, 2, 3, 2]
+    assert areas[of == 2].sum() == pytest.approx(5) and areas[of == 4].sum() == pytest.approx(2.5)
+    assert "polygons and strips are cut into triangles: 7 more cells" in mesh.notes
+
+
+def test_the_polygons_of_a_surface_may_be_a_rigid_tool(tmp_path):
+    """Beside a body of tetrahedra."""
+    scene = block(2, 2, 1)
+    points = np.concatenate([scene.rest_position, np.array(RING) + (1, 1, 2)])
+    faces = [np.array(face) + scene.num_nodes for face in PRISM]
+    cells = np.concatenate(
+        [
+            np.hstack([np.full((scene.num_elements, 1), 4), scene.elements]).ravel(),
+            *([len(face), *face] for face in faces),
+        ]
+    )
+    grid = pyvista.UnstructuredGrid(cells, [*[10] * scene.num_elements, 7, 7, *[9] * 5], points)
+    grid.save(tmp_path / "a.vtu")
+    mesh = read_mesh(tmp_path / "a.vtu")
+    assert mesh.shell_nodes[scene.num_nodes : scene.num_nodes + 10].all()
+    assert len(mesh.elements) == scene.num_elements + 3 * 16
 
 
 @pytest.mark.parametrize(

@@ -39,6 +39,38 @@ def write(path, meshes, mode="Ascii"):
     path.write_text(texts[0][1] + "".join(text[2] for text in texts) + texts[0][3])
 
 
+def declared(names):
+    """A .pvtu file of two pieces."""
+    listed = [
+        "".join(f'<PDataArray type="Float{32 if name == "b" else 64}" Name="{name}{place}"/>' for name in names)
+        for place in ("", " in cells")
+    ]
+    return (
+        '<VTKFile type="PUnstructuredGrid" version="1.0" byte_order="LittleEndian"><PUnstructuredGrid GhostLevel="0">'
+        f"<PPointData>{listed[0]}</PPointData><PCellData>{listed[1]}</PCellData><PPoints>"
+        '<PDataArray type="Float64" Name="Points" NumberOfComponents="3"/></PPoints>'
+        '<Piece Source="left.vtu"/><Piece Source="right.vtu"/></PUnstructuredGrid></VTKFile>'
+    )
+
+
+@pytest.mark.parametrize(("first", "second"), [("abc", "ab"), ("ab", "abc"), ("", "b"), ("ab", "bc"), ("abc", "cba")])
+def test_files_of_pieces_may_lack_a_field(tmp_path, first, second):
+    for name, *args in zip(("left", "right"), SCENES, (0, 3), (first, second), (0, 100), strict=True):
+        grid(*args).save(tmp_path / f"{name}.vtu")
+    names = sorted({*first, *second})
+    (tmp_path / "f.pvtu").write_text(declared(names))
+    mesh = read_mesh(tmp_path / "f.pvtu")
+    assert mesh.path == tmp_path / "f.pvtu" and mesh.source.piece_names == ("left.vtu", "right.vtu")
+    for name in names:
+        value = np.array([PLACE[name] if name in first else np.nan, 100 + PLACE[name] if name in second else np.nan])
+        of_points = np.repeat(value, [one.num_nodes for one in SCENES])
+        np.testing.assert_array_equal(mesh.fields["point"][name], of_points)
+        of_cells = np.repeat(value + 1, [one.num_elements for one in SCENES])
+        np.testing.assert_array_equal(mesh.fields["cell"][f"{name} in cells"], of_cells)
+        lacks = name not in first or name not in second
+        assert any(f"the field {name!r} is missing" in note for note in mesh.notes) == lacks
+
+
 @pytest.mark.parametrize("mode", ["Ascii", "Binary"])
 @pytest.mark.parametrize(
     ("first", "second"),

@@ -9,7 +9,6 @@ from __future__ import annotations
 import base64
 import binascii
 import re
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,7 +17,6 @@ from xml.parsers import expat
 
 import h5py
 import numpy as np
-from scipy.io import netcdf_file
 
 from ast_sim.support.errors import DatasetError, counted
 
@@ -36,18 +34,6 @@ _RATIO_PLAIN = 4
 _CHUNK = 1 << 20
 _APPENDED = b"<AppendedData"
 _Found = TypeVar("_Found")
-
-# How many nodes elements of Exodus may have so that VTK reads them as they are, by the beginning of their kind.
-_NODES_IN_EXODUS = {
-    "TRI": (3, 6),
-    "QUA": (4, 8, 9),
-    "SHE": (3, 4, 8),
-    "TET": (4, 10, 15),
-    "PYR": (5, 13),
-    "WED": (6, 15, 18, 21),
-    "HEX": (8, 20, 27),
-}
-_CELLS = re.compile(r"connect\d+").fullmatch  # the names of the arrays with their nodes
 
 _BYTES = {"8": 1, "16": 2, "32": 4, "64": 8}
 
@@ -239,51 +225,7 @@ def stored_in_hdf(path: Path, group: str) -> int:
         file[group].visititems(look)
         return sum(sizes)
 
-    return _looked_at(path, total)
-
-
-def require_whole_exodus(path: Path) -> None:
-    """Check that an Exodus file of the classic NetCDF kind has the bytes that its head declares, that results do not go
-    on in files with other meshes (job.e-s002 beside job.e), and that VTK knows the elements.
-
-    Raises:
-        DatasetError: they do, or it is cut off: VTK takes zeros for what is missing; or VTK would take other nodes.
-    """
-    further = sorted(path.parent.glob(f"{path.name}-s[0-9]*"))
-    if further:
-        raise DatasetError(f"{path}: goes on in {further[0].name} with another mesh; the mesh must not change")
-    with path.open("rb") as file:
-        head = file.read(8)
-    if head == b"\x89HDF\r\n\x1a\n":
-        _require_known_kinds(path, _looked_at(path, lambda file: [_kind_of(file[one]) for one in file if _CELLS(one)]))
-    if head[:4] not in (b"CDF\1", b"CDF\2") or head[4:] == b"\xff" * 4:  # the number of records is not known
-        return
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # that numbers are still in use
-            with netcdf_file(path, "r", mmap=True) as file:
-                kinds = [_kind_of(one) for name, one in file.variables.items() if _CELLS(name)]
-    except (ValueError, TypeError, IndexError, OSError) as error:
-        raise DatasetError(f"{path}: is cut off or damaged: the file is shorter than it says: copy it whole") from error
-    _require_known_kinds(path, kinds)
-
-
-def _kind_of(cells: Any) -> tuple[str, int]:
-    """What an array with the nodes of a block of Exodus says: the kind of its elements and how many nodes each has."""
-    kind = cells.attrs.get("elem_type", b"") if hasattr(cells, "attrs") else getattr(cells, "elem_type", b"")
-    return (kind.decode("latin-1") if isinstance(kind, bytes) else str(kind)).strip("\0 "), int(cells.shape[-1])
-
-
-def _require_known_kinds(path: Path, kinds: list[tuple[str, int]]) -> None:
-    """Raise DatasetError if a block has elements of which VTK takes other nodes than the file says."""
-    wrong = [(kind, nodes) for kind, nodes in kinds if nodes not in _NODES_IN_EXODUS.get(kind[:3].upper(), (nodes,))]
-    if wrong:
-        kind, nodes = wrong[0]
-        *known, last = _NODES_IN_EXODUS[kind[:3].upper()]
-        raise DatasetError(
-            f"{path}: holds {kind} elements of {nodes} nodes, and VTK mistakes which nodes they have: write them with"
-            f" {', '.join(map(str, known))} or {last} nodes"
-        )
+    return looked_at(path, total)
 
 
 def declared_in_vtkhdf(path: Path) -> list[list[int]]:
@@ -313,7 +255,7 @@ def declared_in_vtkhdf(path: Path) -> list[list[int]]:
                 _require_each_row_once(name, rows, starts[:count], np.array(of_steps)[:, column])
         return of_steps
 
-    return _looked_at(path, counts)
+    return looked_at(path, counts)
 
 
 def _require_each_row_once(name: str, rows: int, starts: np.ndarray, lengths: np.ndarray) -> None:
@@ -330,7 +272,7 @@ def _require_each_row_once(name: str, rows: int, starts: np.ndarray, lengths: np
         raise ValueError(f"the steps use {used} of the {rows} rows of {name!r}: its offsets are wrong")
 
 
-def _looked_at(path: Path, look: Callable[[Any], _Found]) -> _Found:
+def looked_at(path: Path, look: Callable[[Any], _Found]) -> _Found:
     """What a function finds in an HDF5 file; the errors of h5py become errors that name the file."""
     try:
         with h5py.File(path, "r") as file:

@@ -1,5 +1,6 @@
 """Pieces of an XML file that VTK cannot read together. It takes the arrays of each piece by their places in the list of
-the first one, whatever their names: where a piece lacks an array, or lists them in another order, it mixes them up.
+the first one, whatever their names: where a piece lacks an array, or lists them in another order, it mixes them up. It
+refuses pieces in files of their own of which one lacks an array.
 """
 
 from __future__ import annotations
@@ -9,8 +10,11 @@ import re
 import tempfile
 from collections.abc import Collection, Iterator
 from pathlib import Path
+from xml.etree import ElementTree
 
-from ast_sim.importers.formats.declared_sizes import Declared
+from ast_sim.importers.formats.declared_sizes import Declared, declared_in_xml
+
+_FIELDS = ("PPointData", "PCellData")
 
 
 def read_apart(declared: Declared) -> list[list[int]]:
@@ -36,6 +40,20 @@ def are_unlike(declared: Declared) -> bool:
         len({tuple(sorted(one, key=_place)) for one, (points, _) in zip(lists, declared.pieces, strict=True) if points})
         > 1
     )
+
+
+def files_apart(path: Path) -> list[str]:
+    """The files with points that a .pvtu or .pvtp file lists, if one of them lacks a field that it declares, since VTK
+    refuses this; else none."""
+    root = ElementTree.parse(path).getroot()
+    listed = [entry.get("Source", "") for entry in root.iter("Piece")]
+    declared = {name: declared_in_xml(path.parent / name) for name in listed}
+    fields = {
+        (place.tag[1:], array.get("Name", "")) for place in root.iter() if place.tag in _FIELDS for array in place
+    }
+    held = {name: one for name, one in declared.items() if any(points for points, _ in one.pieces)}
+    lack = [name for name, one in held.items() if fields - {(array.place, array.name) for array in one.arrays}]
+    return list(held) if lack else []
 
 
 def _place(array: tuple[str | None, ...]) -> str:

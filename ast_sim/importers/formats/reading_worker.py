@@ -9,7 +9,7 @@ text} is the answer if the file is refused, with "missing" if a package is not i
 The answer: "steps" (how many frames the file holds), "time", and "pieces". Each piece has the arrays `points` [n, 3],
 `types` [c], `offsets` [c + 1], `connectivity` (VTK's types and order of nodes), `point NAME`, `cell NAME`, `global`,
 `block` (the name of the block that it is), `more` (how many more cells it has than the file, where polygons and strips
-are cut), and the sets of nodes of Exodus as `group NAME`.
+are cut), and the nodes of the sets of Exodus as `group nodes NAME` and `group sides NAME`.
 """
 
 from __future__ import annotations
@@ -31,11 +31,10 @@ from typing import Any
 
 import numpy as np
 
+from ast_sim.importers.formats.exodus import EXODUS
 from ast_sim.importers.formats.frd_given_up import given_up
 from ast_sim.importers.formats.frd_results import partly_given, read_frd_headers
 from ast_sim.importers.formats.vtk_data import Block, Refused, arrays_of, blocks_of, of_used_points, time_of
-
-_ENDINGS_OF_EXODUS = {".e", ".ex2", ".exo", ".exoii", ".exii", ".g", ".gen"}
 
 
 def main() -> None:
@@ -88,7 +87,9 @@ def _first_error(lines: list[str]) -> str:
     sentences = [
         line.split("): ", 1)[-1].strip() for line in lines if not line.startswith(("ERROR: In", "Warning: In"))
     ]
-    return (sentences or lines)[0]
+    told = (sentences or lines)[0]
+    unknown = told.removeprefix("Unsupported element type:").strip() if told.startswith("Unsupported element") else None
+    return told if unknown is None else f"VTK does not know its elements of the kind {unknown!r}: leave their block out"
 
 
 def _silent_window() -> Any:
@@ -131,7 +132,7 @@ def _read(path: Path, step: int) -> tuple[dict[str, Any], list[dict[str, np.ndar
     blocks = blocks_of(data)
     time = time_of(data, blocks) if file.set_step is None else file.times[step]
     pieces = [arrays_of(block) for block in blocks]
-    if path.suffix.lower() in _ENDINGS_OF_EXODUS:  # each block has all points of the file
+    if path.suffix.lower() in EXODUS:  # each block has all points of the file
         pieces = [of_used_points(piece) if "connectivity" in piece else piece for piece in pieces]
     return {"steps": len(file.times), "time": time, **file.facts}, pieces
 
@@ -193,7 +194,7 @@ def _opened(path: Path, changed: int, size: int) -> _Opened | _Results:
         for result, nodes in partly_given(path, results, declared):
             partial.setdefault(result.time, []).append((result.name, nodes))
         return _Results(reader, [*reader.time_values] or [None], partial, {"given_up": given_up(path, results)}, folder)
-    if ending in _ENDINGS_OF_EXODUS:
+    if ending in EXODUS:
         return _exodus(path)
     if path.name.lower().startswith("d3plot") or ending == ".d3plot":
         return _dyna(path)
@@ -274,12 +275,14 @@ def _exodus(path: Path) -> _Opened:
     reader.UpdateInformation()
     reader.ApplyDisplacementsOff()
     reader.SetSqueezePoints(False)  # VTK would round the points of each block to single precision
-    for kind in (Reader.NODAL, Reader.ELEM_BLOCK, Reader.NODE_SET):
-        reader.SetAllArrayStatus(kind, 1)
-    for index in range(reader.GetNumberOfObjects(Reader.NODE_SET)):
-        reader.SetObjectStatus(Reader.NODE_SET, index, 1)  # VTK leaves sets out unless they are enabled
+    times = _times(reader)
+    for kind in (Reader.NODAL, Reader.ELEM_BLOCK):
+        reader.SetAllArrayStatus(kind, int(times != [None]))  # without a time there are no values, maybe only names
+    for kind in (Reader.NODE_SET, Reader.SIDE_SET):
+        for index in range(reader.GetNumberOfObjects(kind)):
+            reader.SetObjectStatus(kind, index, 1)  # VTK leaves sets out unless they are enabled
     facts = {"declared": [reader.GetTotalNumberOfNodes(), reader.GetTotalNumberOfElements()]}
-    return _Opened(reader, _times(reader), reader.SetTimeStep, facts)
+    return _Opened(reader, times, reader.SetTimeStep, facts)
 
 
 def _dyna(path: Path) -> _Opened:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import string
 from collections import Counter
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -32,6 +33,24 @@ SHAPES = {
 INSTEAD = "write it as .vtu, .vtk, .msh or .inp"  # what to do with a file of a kind that is not read
 
 BEZIER = "Bezier "  # what the labels of such cells begin with
+
+
+# What stands between the name of a field and a component: stress_xx, sigma-xz, Stress(y,y).
+_SEPARATORS = " _.:([-"
+
+
+def without_separator(name: str) -> str:
+    """A name without the separators at its end."""
+    return name.rstrip(_SEPARATORS)
+
+
+def known_as(name: str, fields: Collection[str]) -> str:
+    """The name of a field among all fields. A separator at the end may be left out: VTK takes disp_x, disp_y and disp_z
+    of Exodus together and calls them `disp_`."""
+    if name in fields:
+        return name
+    meant = [field for field in fields if without_separator(field) == without_separator(name)]
+    return meant[0] if len(meant) == 1 else name
 
 
 def node_count(kind: str) -> int:

@@ -24,13 +24,16 @@ from ast_sim.importers.formats.declared_sizes import (
     declared_in_vtkhdf,
     declared_in_xml,
     needed_bytes,
-    require_whole_exodus,
     stored_in_hdf,
 )
 from ast_sim.importers.formats.dyna_files import require_whole, with_nodes
+from ast_sim.importers.formats.exodus import EXODUS
+from ast_sim.importers.formats.exodus.exodus_files import is_hdf, require_whole_exodus
+from ast_sim.importers.formats.exodus.exodus_groups import groups_in
+from ast_sim.importers.formats.exodus.unwritten import with_nan, written_time
 from ast_sim.importers.formats.frd_given_up import is_left_out
 from ast_sim.importers.formats.frd_results import read_frd_headers
-from ast_sim.importers.formats.pieces_apart import are_unlike, copy_of, read_apart, with_pieces_only
+from ast_sim.importers.formats.pieces_apart import are_unlike, copy_of, files_apart, read_apart, with_pieces_only
 from ast_sim.importers.formats.source_mesh import SourceMesh
 from ast_sim.importers.formats.together import labels_of, together
 from ast_sim.importers.formats.vtk_cells import blocks_of
@@ -38,7 +41,6 @@ from ast_sim.support.environment import of_child
 from ast_sim.support.errors import DatasetError, counted, require
 
 READING_MODULE = "ast_sim.importers.formats.reading_worker"
-EXODUS = (".e", ".ex2", ".exo", ".exoii", ".exii", ".g", ".gen")
 BLOCKS = (".vtm", ".vtmb", ".vtpc", ".vtpd")  # list the files of blocks
 XML = (".vtu", ".pvtu", ".vtp", ".pvtp", ".vts", ".pvts", *BLOCKS)
 ENDINGS = (*XML, ".vtk", ".vtkhdf", *EXODUS, ".frd")
@@ -82,13 +84,23 @@ def vtk_frames(path: Path) -> Iterator[SourceMesh]:
             for parts in zip(*map(vtk_frames, copies), strict=True):
                 yield replace(together(parts), path=path, piece_names=())
         return
+    files = files_apart(path) if path.suffix.lower() in (".pvtu", ".pvtp") else []
+    if files:
+        readings = [vtk_frames(path.parent / file) for file in files]
+        for parts in zip(*readings, strict=True):
+            named = [
+                replace(part, pieces=None, piece_names=(name,))
+                for part, name in zip(parts, labels_of(files), strict=True)
+            ]
+            yield replace(together(named), path=path)
+        return
     of_steps = declared_in_vtkhdf(path) if path.suffix.lower() == ".vtkhdf" else []
     step, steps = 0, 1
     while step < steps:
         head, parts = _worker.ask(path, step, budget)
         steps = head["steps"]
         parts = with_nodes(path, parts) if is_dyna(path) else parts
-        mesh = _mesh(path, parts, head["time"])
+        mesh = _mesh(path, parts, head)
         declared = of_steps[step] if step < len(of_steps) else head.get("declared")
         declared = declared or ([sum(column) for column in zip(*pieces, strict=True)] if pieces else None)
         more = sum(int(part["more"][0]) for part in parts if "more" in part)
@@ -153,7 +165,7 @@ def _checked(path: Path) -> tuple[list[tuple[int, int]], int, list[list[int]]]:
         return (declared.pieces, budget, read_apart(declared)) if ending != ".vts" else ([], budget, [])
     if ending in (".pvtu", ".pvtp", ".pvts", *BLOCKS):
         return *_of_pieces(path), []
-    if ending == ".vtkhdf" or (ending in EXODUS and _is_hdf(path)):
+    if ending == ".vtkhdf" or (ending in EXODUS and is_hdf(path)):
         return [], _OWN_BYTES + _COPIES * stored_in_hdf(path, "VTKHDF" if ending == ".vtkhdf" else "/"), []
     if ending == ".frd":
         (nodes, elements), _ = read_frd_headers(path)
@@ -185,11 +197,6 @@ def _of_pieces(path: Path) -> tuple[list[tuple[int, int]], int]:
             pieces += declared.pieces
             budget += _COPIES * (needed_bytes(declared) + file.stat().st_size)
     return (pieces if path.suffix.lower() == ".pvtu" else []), budget
-
-
-def _is_hdf(path: Path) -> bool:
-    with path.open("rb") as file:
-        return file.read(8) == b"\x89HDF\r\n\x1a\n"
 
 
 class _Worker:
@@ -276,16 +283,21 @@ def _received(stream: Any, listed: list[dict[str, tuple[str, list[int]]]]) -> li
     return pieces
 
 
-def _mesh(path: Path, parts: list[dict[str, np.ndarray]], time: float | None) -> SourceMesh:
-    """One mesh of all parts; the sets of nodes are given by the numbers of points in the whole file."""
+def _mesh(path: Path, parts: list[dict[str, np.ndarray]], head: dict[str, Any]) -> SourceMesh:
+    """One mesh of all parts; the groups are given by the numbers of points in the whole file."""
+    of_exodus = path.suffix.lower() in EXODUS
+    parts, unwritten = with_nan(parts) if of_exodus else (parts, [])
+    time = written_time(head["time"]) if of_exodus else head["time"]
     meshes = [_part(path, part, time) for part in parts if "points" in part and len(part["points"])]
     if not meshes:
         raise DatasetError(f"{path}: holds no points")
     mesh = together(meshes)
-    for part in parts:
-        for name, ids in _named(part, "group ").items():
-            if mesh.same_point is not None:
-                mesh.groups[name] = np.flatnonzero(np.isin(mesh.same_point, ids))
+    mesh.notes.extend(unwritten)
+    if of_exodus and mesh.same_point is not None:
+        groups, notes = groups_in(path, parts, head["declared"][0])
+        mesh.notes.extend(notes)
+        for name, ids in groups.items():
+            mesh.groups[name] = np.flatnonzero(np.isin(mesh.same_point, ids))
     return mesh
 
 

@@ -9,13 +9,18 @@ import numpy as np
 
 from ast_sim.support.errors import DatasetError
 
-_NUMBER = re.compile(r"([0-9]+(?:\.[0-9]+)?(?:[eE][-+]?[0-9]+)?)")
+_NUMBER = re.compile(r"([0-9]+(?:[.,][0-9]+)?(?:[eE][-+]?[0-9]+)?)")
 
 
 def natural_order(path: Path) -> list[tuple[float, str]]:
-    """A sort key by which frame_10 comes after frame_9, and Result-0.0005 before Result-0.001."""
+    """A sort key by which frame_10 comes after frame_9, and Result-0.0005 or Result-0,0005 before Result-0.001."""
     parts = _NUMBER.split(path.stem)
-    return [(float(part), "") if place % 2 else (-1.0, part) for place, part in enumerate(parts)]
+    return [(value_of(part), "") if place % 2 else (-1.0, part) for place, part in enumerate(parts)]
+
+
+def value_of(number: str) -> float:
+    """The value of a number in a name, which may have a decimal comma."""
+    return float(number.replace(",", "."))
 
 
 def words_of(name: str) -> tuple[str, ...]:
@@ -52,7 +57,7 @@ def ordered(files: list[Path], times: list[float | None]) -> tuple[list[int], li
         _require_one_series(files)
         return as_named, [*unused, _said(files, as_named, "their names, which differ in more than a number")]
     whole = sorted(as_named, key=lambda index: _whole_numbers(files[index]))
-    by_number = "the numbers in their names, read with their decimal points"
+    by_number = "the numbers in their names, read with their decimals"
     return as_named, unused + (_doubts(files) if whole == as_named else [_said(files, as_named, by_number)])
 
 

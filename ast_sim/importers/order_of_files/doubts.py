@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ast_sim.importers.order_of_files.by_name import numbers_in, words_of
+from ast_sim.importers.order_of_files.by_name import numbers_in, value_of, words_of
 from ast_sim.support.errors import DatasetError
 
 APART = 1e-6  # of the whole time: files of one run are farther apart
@@ -48,7 +48,7 @@ def _names_against_list(source: Path, names: list[str]) -> list[str]:
             f" {names[other]}): are they of one run?"
         ]
     varied = [column for column in zip(*map(numbers_in, names), strict=True) if len(set(column)) > 1]
-    back = np.flatnonzero(np.diff([float(text) for text in varied[0]]) <= 0) if len(varied) == 1 else []
+    back = np.flatnonzero(np.diff([value_of(text) for text in varied[0]]) <= 0) if len(varied) == 1 else []
     if not len(back):
         return []
     return [f"{source.name} lists {names[back[0] + 1]} after {names[back[0]]}: are their times right?"]

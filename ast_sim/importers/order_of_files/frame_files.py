@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from ast_sim.importers.formats.exodus.exodus_pieces import is_piece
 from ast_sim.importers.formats.vtk_files import BLOCKS
 from ast_sim.importers.frames_in_file import ONE_FRAME, XDMF, holds_frames
 from ast_sim.importers.order_of_files.by_name import natural_order
@@ -29,7 +30,7 @@ def frame_files(source: Path) -> FrameFiles:
         return in_collection(source)
     if source.suffix.lower() == SERIES:
         return in_series(source)
-    if source.suffix.lower() in ONE_FRAME or holds_frames(source):
+    if source.suffix.lower() in ONE_FRAME or holds_frames(source) or is_piece(source):
         return FrameFiles([[source]])
     raise DatasetError(
         f"{source}: must be a .pvd or .series file, a folder of files of frames ({', '.join(ONE_FRAME)}), or one file"

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ast_sim.importers.formats.source_mesh import SourceMesh
+from ast_sim.importers.formats.source_mesh import SourceMesh, known_as
+from ast_sim.importers.solids.positions import fields_of_vector
 from ast_sim.named_field import REACTION, NamedField
 from ast_sim.support.errors import ConfigError, DatasetError, counted
 
@@ -53,11 +54,14 @@ class KeptFields:
 
     def look(self, frame: SourceMesh, cells: np.ndarray | None, read: Callable[..., np.ndarray]) -> None:
         """Keep the fields of a frame, whose cells stand at `cells` in the order of the first frame (None: as there)."""
-        for key, name in self.wanted.items():
+        for key, wanted in self.wanted.items():
+            name = known_as(wanted, [*frame.point_fields, *frame.cell_fields])
             place = "node" if name in frame.point_fields or name not in frame.cell_fields else "element"
+            parts = fields_of_vector(name, frame.point_fields) if place == "node" else [name]
             if self.places.setdefault(key, place) != place:
                 raise DatasetError(f"{frame.path}: the field {name!r} is at each {place}, before at another place")
-            values = read(frame, "point" if place == "node" else "cell", name)
+            at = "point" if place == "node" else "cell"
+            values = np.concatenate([read(frame, at, part) for part in parts], axis=1)
             kept = self.frames.setdefault(key, [])
             if kept and kept[0].shape[1] != values.shape[1]:
                 raise DatasetError(

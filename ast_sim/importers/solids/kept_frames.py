@@ -29,6 +29,16 @@ class KeptFrames:
         whole = len(known) == len(self.times) > 1 and np.isfinite(known).all() and (np.diff(known) > 0).all()
         return tuple(known) if whole else None
 
+    def doubts_of_end(self) -> list[str]:
+        """A note if the last frame holds zeros alone, though others do not: a run that is stopped while it writes may
+        leave them."""
+        held = [one for one in self.displacements if one is not None]
+        if len(held) < 3 or len(held) < len(self.displacements) or held[-1].any() or not held[-2].any():
+            return []
+        if self.stresses and self.stresses[-1].any():
+            return []
+        return ["in the last frame all displacements are 0 again: was the run stopped while it wrote this frame?"]
+
     def doubts(self) -> list[str]:
         """A note if the times of all frames are known and do not ascend, or ascend by rounding alone."""
         if None in self.times or len(self.times) < 2:

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from ast_sim.importers.formats.source_mesh import known_as
 from ast_sim.importers.shells import Shells
-from ast_sim.support.errors import DatasetError, warn
+from ast_sim.support.errors import DatasetError, counted, warn
 
 # Points count as equal if they differ by less than this share of the size of the mesh.
 _AGREEMENT = 1e-4
@@ -25,26 +26,26 @@ _ROUNDING = 0.01
 _COMPONENT = re.compile(r"(.*?)[ _.:(\[-]*([xyz123])[)\]]?", re.IGNORECASE)
 
 
-def fields_of_components(named: str | None, fields: Collection[str]) -> list[str]:
-    """The fields of the components along x, y and, if there is one, z of a displacement that is no field itself: U1, U2
-    and U3 of U. None if x or y is missing, or a component stands twice; if it is not `named`, it is "displacement", and
-    numbers count for nothing: they may be the ones of load cases."""
-    name = named or "displacement"
+def fields_of_vector(named: str | None, fields: Collection[str]) -> list[str]:
+    """The fields that hold a vector: one, or the ones of its components along x, y and, if there is one, z, as U1, U2
+    and U3 of U. It is the displacement if it is not `named`; then none may hold it, and numbers count for nothing: they
+    may be the ones of load cases. Components count if x and y are there, and none stands twice."""
+    name = known_as(named or "displacement", fields)
     if name in fields:
-        return []
+        return [name]
     axes: dict[str, list[str]] = {}
     for field in fields:
         match = _COMPONENT.fullmatch(field.strip())
         if match and match[1].casefold() == name.casefold() and (named or not match[2].isdigit()):
             axes.setdefault("xyz"["xyz123".index(match[2].lower()) % 3], []).append(field)
     once = sorted(axes) in ([*"xy"], [*"xyz"]) and all(len(held) == 1 for held in axes.values())
-    return [axes[axis][0] for axis in sorted(axes)] if once else []
+    return [axes[axis][0] for axis in sorted(axes)] if once else [name] if named else []
 
 
 def told_of_components(named: str | None, fields: Collection[str]) -> list[str]:
-    """A note on a displacement that is put together, if it is; see `fields_of_components`."""
-    parts = fields_of_components(named, fields)
-    return [f"the displacement is put together from {', '.join(parts)}"] if parts else []
+    """A note on a displacement that is put together, if it is; see `fields_of_vector`."""
+    parts = fields_of_vector(named, fields)
+    return [f"the displacement is put together from {', '.join(parts)}"] if len(parts) > 1 else []
 
 
 def rest_and_position(
@@ -63,6 +64,13 @@ def rest_and_position(
         frame = next(frame for frame, one in enumerate(displacements) if one is None)
         raise DatasetError(f"{source}: frame {frame} has no displacement, others have")
     moved = np.stack(given)
+    lacking = (~np.isfinite(moved).all(axis=2)).sum(axis=1)
+    if lacking.any():
+        frame = int(np.flatnonzero(lacking)[0])
+        raise DatasetError(
+            f"{source}: the displacement of frame {frame} is no number at {counted(lacking[frame], 'node')}: was"
+            " the run stopped while it wrote this frame? Then leave the frame out"
+        )
     if np.linalg.norm(_centred(moved[0]) - _centred(at[0])) < _POSITIONS * np.linalg.norm(_centred(at[0])):
         raise DatasetError(
             f"{source}: the displacement holds positions: in the first frame it is about the points themselves; write"

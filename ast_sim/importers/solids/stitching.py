@@ -9,6 +9,8 @@ if the file numbers their points: then two numbers are two points.
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -107,11 +109,16 @@ class Stitching:
         elements = elements[elements > 0]
         return "patches" if len(elements) >= _PATCHES and np.ptp(elements) == 0 else "parts"
 
-    def look(self, mesh: SourceMesh, used_fields: tuple[str, ...] = (), displacement: str = "displacement") -> None:
+    def look(
+        self,
+        mesh: SourceMesh,
+        used_fields: tuple[str, ...] = (),
+        displacement: Collection[str] = ("displacement",),
+    ) -> None:
         """Compare the points and the fields of a frame at the pairs.
 
         Args:
-            displacement: the field in which points that have numbers of their own come apart.
+            displacement: the fields in which points that have numbers of their own come apart.
             used_fields: fields that say what a point is, such as its body: they count even if they look like numbers
                 of points, and cell fields among them count as well.
         """
@@ -132,7 +139,7 @@ class Stitching:
             same = (np.abs(a - b) <= _SAME_VALUE * largest) | (np.isnan(a) & np.isnan(b)) | (a == b)
             self.moved = self.moved or (values.shape[1] == 3 and bool(largest))
             self._differ(f"the field {name!r}", ~same.all(axis=1))
-            self.apart = self.apart or (name == displacement and not same.all())
+            self.apart = self.apart or (name in displacement and not same.all())
         for name in filter(mesh.cell_fields.__contains__, used_fields):
             lowest, highest = _ends_at_points(mesh, name)
             self._differ(f"the field {name!r}", (lowest[one] != lowest[other]) | (highest[one] != highest[other]))

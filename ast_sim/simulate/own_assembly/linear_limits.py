@@ -13,7 +13,7 @@ from scipy.sparse import coo_array, csr_array
 
 from ast_sim.element_topology import LOCAL_EDGES, unit_normals
 from ast_sim.mechanics.case import SolidCase
-from ast_sim.number_arrays import point
+from ast_sim.number_arrays import connected_parts, point
 from ast_sim.simulate.own_assembly.assembly_spec import AssemblySpec
 from ast_sim.simulate.own_assembly.rest_check import surface_of
 from ast_sim.support.errors import counted
@@ -70,9 +70,8 @@ def _thin(spec: AssemblySpec, case: SolidCase, number: int) -> Iterator[Limit]:
     held = np.all(case.scene.prescribed[faces], axis=1)
     wall = np.flatnonzero((other >= 0) & ~held & ~held[other])
     few = wall[_elements_across(case, number, faces[wall], faces[other[wall]]) < ENOUGH]
+    few = few[_can_bend(faces[few], middle[few], thickness[few])]
     if not len(few):
-        return
-    if np.linalg.norm(np.ptp(middle[few], axis=0)) < SLENDER * np.median(thickness[few]):
         return
     first = few[np.argmin(thickness[few])]
     where = point(middle[first] + np.asarray(case.attributes["origin"]))
@@ -82,6 +81,20 @@ def _thin(spec: AssemblySpec, case: SolidCase, number: int) -> Iterator[Limit]:
         f" {spec.unit} thick. If it bends there, it is several times too stiff: {CURE}, or choose a smaller size"
     )
     yield Limit(spec.parts[number].name, "thin", len(few) / len(faces), text)
+
+
+def _can_bend(faces: np.ndarray, middle: np.ndarray, thickness: np.ndarray) -> np.ndarray:
+    """[F] bool: which triangles are of a wall that is long enough. Triangles of a wall share nodes: small knobs that
+    stand apart are none."""
+    nodes, corners = np.unique(faces, return_inverse=True)
+    rows = corners.reshape(faces.shape)
+    wall = connected_parts(rows, len(nodes))[rows[:, 0]]
+    low = np.full((wall.max(initial=0) + 1, 3), np.inf)
+    high = -low
+    np.minimum.at(low, wall, middle)
+    np.maximum.at(high, wall, middle)
+    mean = np.bincount(wall, thickness) / np.bincount(wall)
+    return (np.linalg.norm(high - low, axis=1) >= SLENDER * mean)[wall]
 
 
 def _across(rest: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
