@@ -50,14 +50,14 @@ class Plan:
         seeds: of the trainings; the run of the first one ships.
     """
 
-    nodes: int = 1400
+    nodes: int = 3400
     train: int = 80
     valid: int = 6
     test: int = 30
     calibration: int = 40
     steps: int = 3600
     settings: tuple[tuple[str, Any], ...] = (("mirror", ("y",)), ("stress_weight", 0.3))
-    seeds: tuple[int, ...] = (0, 1)
+    seeds: tuple[int, ...] = (0,)
 
 
 def trained(plan: Plan, folder: Path, seed: int = 0) -> tuple[ast_sim.Run, Path]:

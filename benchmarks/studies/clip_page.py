@@ -21,7 +21,7 @@ ANSWERS = (
     ("Gaussian process", "gaussian_process"),
 )
 
-TABLES = {"scenes": "test scenes", "unseen": "more scenes, which nobody had looked at"}
+TABLES = {"scenes": "test scenes", "unseen": "more scenes, by which nothing was chosen"}
 
 _INTRODUCTION = """# A metal clip: permanent set and peak force
 

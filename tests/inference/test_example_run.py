@@ -72,7 +72,7 @@ def test_a_clip_that_is_asked_for_by_its_parameters_has_the_set_and_the_force_of
         names = ("length", "thickness", "place", "travel", "yield_stress")
         parameters = {name: known["parameters"][name] for name in names}
         parameters["file"] = {"clip": known["parameters"]["clip.file"]}
-        answer = run.predict(spec=SPEC, parameters=parameters, nodes=1400)
+        answer = run.predict(spec=SPEC, parameters=parameters, nodes=3400)
         said = outcome(answer.scene, answer.position[0], answer.position[-1], answer.fields[REACTION].values)
         assert said == pytest.approx(tuple(known["true"].values()), rel=0.1)
         assert answer.fields["PEEQ"].values[-1].max() > 0.01 and answer.frames == tuple(range(LAST + 1))
@@ -95,7 +95,7 @@ def test_ten_scenes_of_the_repository_have_the_errors_of_the_page():
 
 def test_a_sweep_sees_where_the_ram_turns():
     """In the last frame the ram is back, whatever its travel."""
-    sweep = ast_sim.example_run("clip").sweep(SPEC, {"travel": [1.2, 2.4, 3.6]}, nodes=1400)
+    sweep = ast_sim.example_run("clip").sweep(SPEC, {"travel": [1.2, 2.4, 3.6]}, nodes=3400)
     assert [row["travel_of_nodes"] for row in sweep.rows] == [0, 0, 0]
     strains = [row["largest_PEEQ"] for row in sweep.rows]
     assert strains[1] > 1.2 * strains[0] and strains[2] > 1.2 * strains[1]
