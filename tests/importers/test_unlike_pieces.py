@@ -53,6 +53,16 @@ def declared(names):
     )
 
 
+def require_fields(mesh, names, first, second):
+    """The fields of both pieces have their values where a piece has them, and are NaN elsewhere."""
+    for name in names:
+        value = np.array([PLACE[name] if name in first else np.nan, 100 + PLACE[name] if name in second else np.nan])
+        of_points = np.repeat(value, [one.num_nodes for one in SCENES])
+        np.testing.assert_array_equal(mesh.fields["point"][name], of_points)
+        of_cells = np.repeat(value + 1, [one.num_elements for one in SCENES])
+        np.testing.assert_array_equal(mesh.fields["cell"][f"{name} in cells"], of_cells)
+
+
 @pytest.mark.parametrize(("first", "second"), [("abc", "ab"), ("ab", "abc"), ("", "b"), ("ab", "bc"), ("abc", "cba")])
 def test_files_of_pieces_may_lack_a_field(tmp_path, first, second):
     for name, *args in zip(("left", "right"), SCENES, (0, 3), (first, second), (0, 100), strict=True):
@@ -61,12 +71,8 @@ def test_files_of_pieces_may_lack_a_field(tmp_path, first, second):
     (tmp_path / "f.pvtu").write_text(declared(names))
     mesh = read_mesh(tmp_path / "f.pvtu")
     assert mesh.path == tmp_path / "f.pvtu" and mesh.source.piece_names == ("left.vtu", "right.vtu")
+    require_fields(mesh, names, first, second)
     for name in names:
-        value = np.array([PLACE[name] if name in first else np.nan, 100 + PLACE[name] if name in second else np.nan])
-        of_points = np.repeat(value, [one.num_nodes for one in SCENES])
-        np.testing.assert_array_equal(mesh.fields["point"][name], of_points)
-        of_cells = np.repeat(value + 1, [one.num_elements for one in SCENES])
-        np.testing.assert_array_equal(mesh.fields["cell"][f"{name} in cells"], of_cells)
         lacks = name not in first or name not in second
         assert any(f"the field {name!r} is missing" in note for note in mesh.notes) == lacks
 
@@ -83,12 +89,8 @@ def test_each_piece_has_the_fields_that_it_names(tmp_path, mode, first, second):
     mesh = read_mesh(tmp_path / "f.vtu")
     names = sorted({*first, *second})
     assert sorted(mesh.fields["point"]) == names and len(mesh.elements) == sum(one.num_elements for one in SCENES)
+    require_fields(mesh, names, first, second)
     for name in names:
-        value = np.array([PLACE[name] if name in first else np.nan, 100 + PLACE[name] if name in second else np.nan])
-        of_points = np.repeat(value, [one.num_nodes for one in SCENES])
-        np.testing.assert_array_equal(mesh.fields["point"][name], of_points)
-        of_cells = np.repeat(value + 1, [one.num_elements for one in SCENES])
-        np.testing.assert_array_equal(mesh.fields["cell"][f"{name} in cells"], of_cells)
         rows = sum(one.num_nodes for one, lists in zip(SCENES, (first, second), strict=True) if name not in lists)
         note = f"the field {name!r} is missing in some blocks: it is NaN in {rows} rows"
         assert (note in mesh.notes) == (rows > 0)

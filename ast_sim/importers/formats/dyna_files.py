@@ -15,7 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ast_sim.support.errors import DatasetError
+from ast_sim.importers.formats.source_mesh import SourceMesh
+from ast_sim.support.errors import DatasetError, counted
 
 _CONTROL = 64  # words; the numbers of the words that are used here:
 _FILE_TYPE, _DIMENSION, _NODES, _SOLIDS, _BEAMS, _SHELLS, _THICK, _EXTRA = 11, 15, 16, 23, 28, 31, 40, 57
@@ -92,3 +93,14 @@ def _parts(words: np.ndarray, place: int, count: int) -> Iterator[np.ndarray]:
             used = np.unique(table[table[:, -1] == part, :nodes])
             if len(used) and used[0] >= 0 and used[-1] < count:
                 yield used.astype(np.int64)
+
+
+def require_no_deleted(mesh: SourceMesh) -> None:
+    """Raise DatasetError if elements of LS-DYNA are deleted, as where a material fails; VTK makes ghosts of them."""
+    deleted = sum(int(np.count_nonzero(np.nan_to_num(ghosts))) for ghosts in mesh.cell_fields.get("vtkGhostType", []))
+    if deleted:
+        at = "" if mesh.time is None else f" at the time {mesh.time:g}"
+        raise DatasetError(
+            f"{mesh.path}: {counted(deleted, 'element is', 'elements are')} deleted{at}, but all frames of a scene have"
+            " the same ones: end the results before"
+        )

@@ -8,11 +8,11 @@ from __future__ import annotations
 import contextlib
 import re
 import tempfile
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from xml.etree import ElementTree
 
-from ast_sim.importers.formats.declared_sizes import Declared, declared_in_xml
+from ast_sim.importers.formats.declared_sizes import Declared
 
 _FIELDS = ("PPointData", "PCellData")
 
@@ -42,12 +42,14 @@ def are_unlike(declared: Declared) -> bool:
     )
 
 
-def files_apart(path: Path) -> list[str]:
+def files_apart(path: Path, declared: Mapping[str, Declared]) -> list[str]:
     """The files with points that a .pvtu or .pvtp file lists, if one of them lacks a field that it declares, since VTK
-    refuses this; else none."""
+    refuses this; else none.
+
+    Args:
+        declared: what each of these files says, by its name.
+    """
     root = ElementTree.parse(path).getroot()
-    listed = [entry.get("Source", "") for entry in root.iter("Piece")]
-    declared = {name: declared_in_xml(path.parent / name) for name in listed}
     fields = {
         (place.tag[1:], array.get("Name", "")) for place in root.iter() if place.tag in _FIELDS for array in place
     }

@@ -12,10 +12,10 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
@@ -26,7 +26,7 @@ from ast_sim.importers.formats.declared_sizes import (
     needed_bytes,
     stored_in_hdf,
 )
-from ast_sim.importers.formats.dyna_files import require_whole, with_nodes
+from ast_sim.importers.formats.dyna_files import require_no_deleted, require_whole, with_nodes
 from ast_sim.importers.formats.exodus import EXODUS
 from ast_sim.importers.formats.exodus.exodus_files import is_hdf, require_whole_exodus
 from ast_sim.importers.formats.exodus.exodus_groups import groups_in
@@ -72,7 +72,7 @@ def vtk_frames(path: Path) -> Iterator[SourceMesh]:
         DatasetError: VTK refuses the file, crashes on it, or makes something else of it than the file says it holds.
         MissingExtra: VTK is not installed.
     """
-    pieces, budget, apart = _checked(path)
+    pieces, budget, apart, files = _checked(path)
     if path.suffix.lower() == ".vtk" and _ends_in_a_number(path):
         with copy_of(path, path.read_bytes() + b"\n") as copy:
             told = "the file ends without a line end: is its last number cut off?"
@@ -84,14 +84,11 @@ def vtk_frames(path: Path) -> Iterator[SourceMesh]:
             for parts in zip(*map(vtk_frames, copies), strict=True):
                 yield replace(together(parts), path=path, piece_names=())
         return
-    files = files_apart(path) if path.suffix.lower() in (".pvtu", ".pvtp") else []
     if files:
         readings = [vtk_frames(path.parent / file) for file in files]
+        labels = labels_of(files)
         for parts in zip(*readings, strict=True):
-            named = [
-                replace(part, pieces=None, piece_names=(name,))
-                for part, name in zip(parts, labels_of(files), strict=True)
-            ]
+            named = [replace(one, pieces=None, piece_names=(name,)) for one, name in zip(parts, labels, strict=True)]
             yield replace(together(named), path=path)
         return
     of_steps = declared_in_vtkhdf(path) if path.suffix.lower() == ".vtkhdf" else []
@@ -107,7 +104,7 @@ def vtk_frames(path: Path) -> Iterator[SourceMesh]:
         mesh.notes.extend([f"polygons and strips are cut into triangles: {counted(more, 'more cell')}"] if more else [])
         _require_counts(mesh, declared and [declared[0], declared[1] + more])
         if is_dyna(path):
-            _require_no_deleted(mesh)
+            require_no_deleted(mesh)
         step += 1
         if step == steps and is_left_out(path, head.get("given_up", False), steps, head["time"]):
             return
@@ -141,20 +138,16 @@ def _require_counts(mesh: SourceMesh, declared: list[int] | None) -> None:
         )
 
 
-def _require_no_deleted(mesh: SourceMesh) -> None:
-    """Raise DatasetError if elements of LS-DYNA are deleted, as where a material fails; VTK makes ghosts of them."""
-    deleted = sum(int(np.count_nonzero(np.nan_to_num(ghosts))) for ghosts in mesh.cell_fields.get("vtkGhostType", []))
-    if deleted:
-        at = "" if mesh.time is None else f" at the time {mesh.time:g}"
-        raise DatasetError(
-            f"{mesh.path}: {counted(deleted, 'element is', 'elements are')} deleted{at}, but all frames of a scene have"
-            " the same ones: end the results before"
-        )
+class _Checked(NamedTuple):
+    """What a file says of itself before VTK reads it."""
+
+    pieces: list[tuple[int, int]]  # the points and cells of each, if the file says them
+    budget: int  # bytes of memory that VTK may take
+    apart: Sequence[list[int]] = ()  # which pieces are to be read apart
+    files: Sequence[str] = ()  # of pieces, if each is to be read by itself
 
 
-def _checked(path: Path) -> tuple[list[tuple[int, int]], int, list[list[int]]]:
-    """The points and cells of each piece, if the file says them, the bytes of memory that VTK may take, and which
-    pieces are to be read apart."""
+def _checked(path: Path) -> _Checked:
     ending = path.suffix.lower()
     size = path.stat().st_size
     if ending in EXODUS:
@@ -162,33 +155,34 @@ def _checked(path: Path) -> tuple[list[tuple[int, int]], int, list[list[int]]]:
     if ending in (".vtu", ".vtp", ".vts"):
         declared = declared_in_xml(path)
         budget = _OWN_BYTES + _COPIES * (needed_bytes(declared) + size)
-        return (declared.pieces, budget, read_apart(declared)) if ending != ".vts" else ([], budget, [])
+        return _Checked(declared.pieces, budget, read_apart(declared)) if ending != ".vts" else _Checked([], budget)
     if ending in (".pvtu", ".pvtp", ".pvts", *BLOCKS):
-        return *_of_pieces(path), []
+        return _of_pieces(path)
     if ending == ".vtkhdf" or (ending in EXODUS and is_hdf(path)):
-        return [], _OWN_BYTES + _COPIES * stored_in_hdf(path, "VTKHDF" if ending == ".vtkhdf" else "/"), []
+        return _Checked([], _OWN_BYTES + _COPIES * stored_in_hdf(path, "VTKHDF" if ending == ".vtkhdf" else "/"))
     if ending == ".frd":
         (nodes, elements), _ = read_frd_headers(path)
-        return [(nodes, elements)], _OWN_BYTES + _LARGEST_RATIO * size, []
+        return _Checked([(nodes, elements)], _OWN_BYTES + _LARGEST_RATIO * size)
     if is_dyna(path):
         require_whole(path)
         size = sum(part.stat().st_size for part in path.parent.glob(f"{path.name}*"))
-    return [], _OWN_BYTES + _LARGEST_RATIO * size, []
+    return _Checked([], _OWN_BYTES + _LARGEST_RATIO * size)
 
 
-def _of_pieces(path: Path) -> tuple[list[tuple[int, int]], int]:
+def _of_pieces(path: Path) -> _Checked:
     """As `_checked`, of a file that lists the files of its pieces or blocks."""
     listed = declared_in_xml(path).sources
     if path.suffix.lower() in BLOCKS:
         listed = [entry.attrib["file"] for entry in ElementTree.parse(path).iter("DataSet") if entry.get("file")]
     pieces = []
     budget = _OWN_BYTES
+    told = {}
     for name in listed:
         file = path.parent / name
         if not file.is_file():
             raise DatasetError(f"{path}: lists {name}, which does not exist")
         if file.suffix.lower() in (".vtu", ".vtp", ".vts"):
-            declared = declared_in_xml(file)
+            told[name] = declared = declared_in_xml(file)
             if are_unlike(declared):
                 raise DatasetError(
                     f"{file}: its pieces have different fields, or the same in another order, and VTK mixes them up:"
@@ -196,7 +190,8 @@ def _of_pieces(path: Path) -> tuple[list[tuple[int, int]], int]:
                 )
             pieces += declared.pieces
             budget += _COPIES * (needed_bytes(declared) + file.stat().st_size)
-    return (pieces if path.suffix.lower() == ".pvtu" else []), budget
+    files = files_apart(path, told) if path.suffix.lower() in (".pvtu", ".pvtp") else ()
+    return _Checked(pieces if path.suffix.lower() == ".pvtu" else [], budget, files=files)
 
 
 class _Worker:
