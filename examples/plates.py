@@ -2,7 +2,9 @@
 
     python examples/plates.py [FOLDER]
 
-takes about three minutes on two cores and prints the error of the prediction beside the error of holding still.
+takes about three minutes on two cores and prints the error of the prediction beside the error of holding still. Both
+are relative to the simulations, whose mesh of linear elements is too stiff: 11 % of the displacement and 96 % of the
+force. Where forces count, `examples/snap_hook` and `examples/bumper` are the pattern.
 """
 
 import sys
