@@ -55,6 +55,21 @@ def test_heads_that_name_what_is_not_there_are_refused(tmp_path):
         read_netcdf_head(path)
 
 
+def test_a_length_that_no_memory_holds_is_refused(tmp_path):
+    (tmp_path / "a.e").write_bytes(b"CDF\5" + bytes(8) + struct.pack(">iqq", 10, 1, 1 << 62))
+    with pytest.raises(DatasetError, match=CUT_OFF):
+        exodus_facts(tmp_path / "a.e")
+
+
+def test_heads_of_each_kind_say_the_same(tmp_path):
+    facts = []
+    for version in (1, 2, 5):
+        exodus().write(tmp_path / "a.e", version)
+        assert read_netcdf_head(tmp_path / "a.e").needed == (tmp_path / "a.e").stat().st_size
+        facts.append(exodus_facts(tmp_path / "a.e"))
+    assert facts[0] == facts[1] == facts[2] and facts[0].steps == 3 and facts[0].timed
+
+
 def test_the_bytes_that_a_file_must_have_are_counted(tmp_path):
     """Records are filled up to whole words, but not if there is one variable of records alone."""
     path = tmp_path / "a.e"
