@@ -63,7 +63,7 @@ _AT_CORNERS = ((0, 4, 6, 7), (4, 1, 5, 8), (6, 5, 2, 9), (7, 8, 9, 3))
 _EIGHTH = (*_AT_CORNERS, (4, 9, 6, 7), (4, 9, 5, 6), (4, 9, 8, 5), (4, 9, 7, 8))
 
 
-def _slopes(weights: np.ndarray) -> np.ndarray:
+def slopes_at(weights: np.ndarray) -> np.ndarray:
     """[n, 10, 3] the derivatives of the shape functions by the coordinates of corners 1, 2 and 3."""
     by_corner = np.zeros((len(weights), 10, 4))
     by_corner[:, range(4), range(4)] = 4 * weights - 1
@@ -77,7 +77,7 @@ def _slopes(weights: np.ndarray) -> np.ndarray:
 # coordinates [point, corner]; each point has a quarter of the volume.
 _FAR, _NEAR = (5 - 5**0.5) / 20, (5 + 3 * 5**0.5) / 20
 POINTS = np.full((4, 4), _FAR) + (_NEAR - _FAR) * np.eye(4)
-SLOPES = _slopes(POINTS)  # [point, node, 3]
+SLOPES = slopes_at(POINTS)  # [point, node, 3]
 
 
 def linear_elements(elements: np.ndarray) -> np.ndarray:

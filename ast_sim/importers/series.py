@@ -230,9 +230,9 @@ def _put_in_order_of_time(source: Path, kept: KeptFrames, further: KeptFields) -
         by_time, said = ordered([file for (file,) in files], kept.times)
         kept.reorder(by_time)
         further.reorder(by_time)
-        return [*notes, *said]
+        return [*notes, *said, *kept.without_times()]
     if times is None:
-        return [*notes, *kept.doubts(), *kept.doubts_of_end()]
+        return [*notes, *(kept.doubts() or kept.without_times()), *kept.doubts_of_end()]
     notes = [*notes, *doubts_of_times(source, times, kept.times)]
     kept.times = list(times)
     return notes

@@ -10,6 +10,7 @@ import numpy as np
 
 from ast_sim.element_topology import equal_rows, folded_elements, point_volumes
 from ast_sim.number_arrays import connected_parts
+from ast_sim.plausibility.curved_elements import partly_inside_out
 from ast_sim.plausibility.findings import Finding, places
 from ast_sim.plausibility.overlaps import overlaps
 from ast_sim.scene import Scene
@@ -53,12 +54,19 @@ def _single_elements(scene: Scene) -> list[Finding]:
 
 
 def _inside_out(scene: Scene) -> list[Finding]:
-    """Elements that have no volume where forces are integrated, however their nodes are numbered. In second-order ones
-    a piece between nodes and curved edges may be inside out all the same."""
+    """Elements that have no volume where forces are integrated, however their nodes are numbered; and second-order ones
+    that have none elsewhere. In others a piece between nodes and curved edges may be inside out all the same."""
     volumes = np.where(scene.rest_volumes < 0, -1, 1) * point_volumes(scene.rest_position, scene.elements)
-    rows = np.flatnonzero((volumes <= 0).any(axis=0))
+    wrong = (volumes <= 0).any(axis=0)
+    rows = np.flatnonzero(wrong)
     meaning = "they are flat, or their edges are bent too far: they cannot be computed with"
-    return [Finding("elements inside out", len(rows), _elements(scene, rows), meaning)] if len(rows) else []
+    findings = [Finding("elements inside out", len(rows), _elements(scene, rows), meaning)] if len(rows) else []
+    if len(volumes) == 1:
+        return findings
+    rows = np.flatnonzero(partly_inside_out(scene.rest_position, scene.elements) & ~wrong)
+    meaning = "the node of an edge lies a quarter of it or more from the middle, or the edge is bent far: mesh it again"
+    told = Finding("elements of which a part is inside out", len(rows), _elements(scene, rows), meaning)
+    return [*findings, told] if len(rows) else findings
 
 
 def no_scene(scene: Scene) -> list[Finding]:

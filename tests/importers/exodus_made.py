@@ -1,9 +1,10 @@
-"""Exodus files of a block that a tool presses, as classic NetCDF of each kind, byte by byte."""
+"""Exodus files of a block that a tool presses, as classic NetCDF of each kind, byte by byte, and as NetCDF-4."""
 
 import struct
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import h5py
 import numpy as np
 from blocks import block
 
@@ -59,6 +60,25 @@ class Netcdf:
         for record in range(records):
             content += b"".join(data[name][record] for name in data if name in moving)
         path.write_bytes(content)
+
+    def write_hdf(self, path: Path) -> None:
+        """As NetCDF-4, which is HDF5."""
+        moving = [values for dimensions, values, _ in self.variables.values() if dimensions[:1] == ("time_step",)]
+        lengths = self.dimensions | {"time_step": max(map(len, moving), default=0)}
+        with h5py.File(path, "w") as file:
+            file.attrs.update({name: np.float32(5.1) for name in ("api_version", "version")})
+            file.attrs.update(floating_point_word_size=np.int32(8), file_size=np.int32(1), title=np.bytes_("made"))
+            for name, length in lengths.items():
+                most = None if name == "time_step" else length
+                file.create_dataset(name, (length,), "f4", maxshape=(most,), chunks=True).make_scale(
+                    f"This is a netCDF dimension but not a netCDF variable. {length:9d}"
+                )
+            for name, (dimensions, values, texts) in self.variables.items():
+                most = [None if one == "time_step" else lengths[one] for one in dimensions]
+                array = file.create_dataset(name, data=values, maxshape=most, chunks=True)
+                for axis, one in enumerate(dimensions):
+                    array.dims[axis].attach_scale(file[one])
+                array.attrs.update({key: np.bytes_(value) for key, value in texts.items()})
 
     def size(self, name: str) -> int:
         """The bytes of a variable, or of one record, filled up to whole words."""

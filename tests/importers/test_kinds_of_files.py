@@ -101,7 +101,8 @@ def test_results_that_are_left_out_are_told(tmp_path):
         grid(pressed(frame)).save(tmp_path / "sub" / f"g_{frame}.vtu")
     grid(pressed(0)).extract_surface(algorithm="dataset_surface").save(tmp_path / "tool.vtp")
     notes = read_series(tmp_path, NAMES).attributes["notes"]
-    assert notes == f"2 other files or folders with results in {tmp_path.name} are left out: sub, tool.vtp"
+    told = f"2 other files or folders with results in {tmp_path.name} are left out: sub, tool.vtp"
+    assert notes == f"{told}; no times tell the 3 frames apart: they count 0, 1, 2, ..."
     listed = "".join(f'<DataSet timestep="{frame}" file="sub/g_{frame}.vtu"/>' for frame in range(3))
     (tmp_path / "g.pvd").write_text(f'<VTKFile type="Collection"><Collection>{listed}</Collection></VTKFile>')
     with pytest.warns(UserWarning, match="4 other files or folders with results in .* are left out: f_0.vtu, f_1.vtu,"):

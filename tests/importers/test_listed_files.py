@@ -144,9 +144,10 @@ def test_times_in_a_folder_that_are_not_used_are_told(folder, tmp_path_factory):
     files = tmp_path_factory.mktemp("files")
     for frame, name in enumerate(("t_0", "t_1", "t_2", "t_1")):
         shutil.copy(folder / f"{name}.vtu", files / f"f_{frame}.vtu")
-    assert notes(files) == "f_1.vtu and f_3.vtu say the same time 0.1: the times inside are not used"
+    count = "no times tell the 4 frames apart: they count 0, 1, 2, ..."
+    assert notes(files) == f"f_1.vtu and f_3.vtu say the same time 0.1: the times inside are not used; {count}"
     shutil.copy(folder / "a_3.vtu", files / "f_3.vtu")
-    assert notes(files) == "f_3.vtu says no time, other files do: the times inside are not used"
+    assert notes(files) == f"f_3.vtu says no time, other files do: the times inside are not used; {count}"
 
 
 def test_vtkhdf_files_of_one_frame_each_may_be_listed(tmp_path):

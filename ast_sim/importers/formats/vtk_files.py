@@ -72,7 +72,7 @@ def vtk_frames(path: Path) -> Iterator[SourceMesh]:
         DatasetError: VTK refuses the file, crashes on it, or makes something else of it than the file says it holds.
         MissingExtra: VTK is not installed.
     """
-    pieces, budget, apart, files = _checked(path)
+    pieces, budget, apart, files, timed = _checked(path)
     if path.suffix.lower() == ".vtk" and _ends_in_a_number(path):
         with copy_of(path, path.read_bytes() + b"\n") as copy:
             told = "the file ends without a line end: is its last number cut off?"
@@ -96,6 +96,7 @@ def vtk_frames(path: Path) -> Iterator[SourceMesh]:
     while step < steps:
         head, parts = _worker.ask(path, step, budget)
         steps = head["steps"]
+        head["time"] = head["time"] if timed else None
         parts = with_nodes(path, parts) if is_dyna(path) else parts
         mesh = _mesh(path, parts, head)
         declared = of_steps[step] if step < len(of_steps) else head.get("declared")
@@ -145,13 +146,13 @@ class _Checked(NamedTuple):
     budget: int  # bytes of memory that VTK may take
     apart: Sequence[list[int]] = ()  # which pieces are to be read apart
     files: Sequence[str] = ()  # of pieces, if each is to be read by itself
+    timed: bool = True  # whether the frames have times
 
 
 def _checked(path: Path) -> _Checked:
     ending = path.suffix.lower()
     size = path.stat().st_size
-    if ending in EXODUS:
-        require_whole_exodus(path)
+    timed = ending not in EXODUS or require_whole_exodus(path)
     if ending in (".vtu", ".vtp", ".vts"):
         declared = declared_in_xml(path)
         budget = _OWN_BYTES + _COPIES * (needed_bytes(declared) + size)
@@ -159,14 +160,15 @@ def _checked(path: Path) -> _Checked:
     if ending in (".pvtu", ".pvtp", ".pvts", *BLOCKS):
         return _of_pieces(path)
     if ending == ".vtkhdf" or (ending in EXODUS and is_hdf(path)):
-        return _Checked([], _OWN_BYTES + _COPIES * stored_in_hdf(path, "VTKHDF" if ending == ".vtkhdf" else "/"))
+        budget = _OWN_BYTES + _COPIES * stored_in_hdf(path, "VTKHDF" if ending == ".vtkhdf" else "/")
+        return _Checked([], budget, timed=timed)
     if ending == ".frd":
         (nodes, elements), _ = read_frd_headers(path)
         return _Checked([(nodes, elements)], _OWN_BYTES + _LARGEST_RATIO * size)
     if is_dyna(path):
         require_whole(path)
         size = sum(part.stat().st_size for part in path.parent.glob(f"{path.name}*"))
-    return _Checked([], _OWN_BYTES + _LARGEST_RATIO * size)
+    return _Checked([], _OWN_BYTES + _LARGEST_RATIO * size, timed=timed)
 
 
 def _of_pieces(path: Path) -> _Checked:

@@ -29,6 +29,12 @@ class KeptFrames:
         whole = len(known) == len(self.times) > 1 and np.isfinite(known).all() and (np.diff(known) > 0).all()
         return tuple(known) if whole else None
 
+    def without_times(self) -> list[str]:
+        """A note if nothing says when each frame is: no time, or the same for several."""
+        if len(self.times) < 2 or self.ascending_times() is not None:
+            return []
+        return [f"no times tell the {len(self.times):,} frames apart: they count 0, 1, 2, ..."]
+
     def doubts_of_end(self) -> list[str]:
         """A note if the last frame holds zeros alone, though others do not: a run that is stopped while it writes may
         leave them."""

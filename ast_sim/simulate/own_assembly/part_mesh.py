@@ -30,7 +30,7 @@ from ast_sim.simulate.shapes.cad.surface_mend import TriangleSurface, stl_surfac
 from ast_sim.simulate.shapes.mesh import second_order, straightened
 from ast_sim.simulate.shapes.mesh_check import BadMesh, check_mesh, check_no_intersections, check_surface
 from ast_sim.simulate.shapes.parts import oriented, volumes
-from ast_sim.support.errors import ConfigError, MissingExtra, nearest_name
+from ast_sim.support.errors import ConfigError, MissingExtra, counted, nearest_name
 
 SMALLEST_ANGLE = 1.0  # degrees between two faces of a tetrahedron: enough for the solver
 MESHES_KEPT = 64
@@ -208,7 +208,7 @@ def _from_file(part: PartSpec, request: dict[str, Any]) -> PartMesh:
         return _surface_mesh(part, request, replace(surface, notes=(*told, *surface.notes)))
     mesh = PartMesh(request["name"], position, elements, groups, fields, notes)
     mesh = _raised(mesh) if request["order"] == 2 and elements.shape[1] == 4 else mesh
-    return _checked(_halved(mesh) if request["halved"] else mesh, part.rigid)
+    return _checked(_halved(mesh) if request["halved"] else mesh, part.rigid, from_file=True)
 
 
 def _halved(mesh: PartMesh) -> PartMesh:
@@ -248,8 +248,8 @@ def _surface_mesh(part: PartSpec, request: dict[str, Any], surface: TriangleSurf
     return _checked(mesh, part.rigid)
 
 
-def _checked(mesh: PartMesh, rigid: bool) -> PartMesh:
-    """The mesh after all checks, its tetrahedra of positive volume.
+def _checked(mesh: PartMesh, rigid: bool, from_file: bool = False) -> PartMesh:
+    """The mesh after all checks, its tetrahedra of positive volume. A note says which edges of a file become straight.
 
     Raises:
         BadMesh: it cannot be used.
@@ -268,4 +268,7 @@ def _checked(mesh: PartMesh, rigid: bool) -> PartMesh:
             cells = oriented(position, cells)
         position = straightened(position, cells) if cells.shape[1] == 10 else position
     check_mesh(position, cells, mesh.name, SMALLEST_ANGLE)
-    return PartMesh(mesh.name, position, cells, mesh.groups, mesh.fields, mesh.notes)
+    changed = int((position != mesh.position).any(axis=1)[cells].any(axis=1).sum())
+    get = f"{mesh.name}: {counted(changed, 'element gets', 'elements get')} straight edges"
+    notes = (f"{get}: as in the file they would turn a part of an element over",) if changed and from_file else ()
+    return PartMesh(mesh.name, position, cells, mesh.groups, mesh.fields, (*mesh.notes, *notes))

@@ -13,6 +13,7 @@ import numpy as np
 
 from ast_sim.element_topology import MIDDLES
 from ast_sim.mechanics.elements.second_order import points_at_rest
+from ast_sim.plausibility.curved_elements import partly_inside_out
 
 STRAIGHTENED_BELOW = 0.3  # least volume of a quarter of a curved element, relative to a straight one
 
@@ -135,7 +136,8 @@ def straightened(position: np.ndarray, elements: np.ndarray) -> np.ndarray:
     position = position.copy()
     wanted = STRAIGHTENED_BELOW * np.abs(np.linalg.det(position[elements[:, 1:4]] - position[elements[:, :1]])) / 24
     for _ in range(len(elements)):
-        bad = elements[(points_at_rest(position, elements)[0] < wanted).any(axis=0)]
+        thin = (points_at_rest(position, elements)[0] < wanted).any(axis=0)
+        bad = elements[thin | partly_inside_out(position, elements)]
         ends = bad[:, np.array(MIDDLES)]
         middles = position[ends].mean(axis=2)
         if np.allclose(position[bad[:, 4:]], middles, rtol=0, atol=1e-12 * np.ptp(position, axis=0).max()):

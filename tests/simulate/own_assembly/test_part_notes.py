@@ -11,6 +11,7 @@ from ast_sim.scene import NodeType
 from ast_sim.simulate.own_assembly.parameters import completed
 from ast_sim.simulate.own_assembly.part_mesh import part_meshes
 from ast_sim.simulate.own_assembly.spec_reader import read_spec
+from ast_sim.simulate.shapes.mesh import second_order
 from ast_sim.simulate.shapes.part_source import part_source
 
 BLOCK = "block (block.vtu): "
@@ -44,6 +45,25 @@ def test_the_notes_of_a_mesh_are_the_notes_of_its_part(tmp_path, kind):
     (note,) = block.notes
     assert note.startswith(BLOCK) and told in note
     assert not punch.notes
+
+
+@pytest.mark.parametrize(("share", "straight"), [(0.2, False), (0.3, True), (0.5, True)])
+def test_edges_of_a_file_that_become_straight_are_told(tmp_path, share, straight):
+    """From a quarter of the edge on, a node off its middle turns a part of its elements over."""
+    spec = read_spec(write_assembly(tmp_path, SPEC.replace("order = 1", "order = 2")))
+    position, elements = second_order(*box((0, 0, 0), (10, 10, 5), (4, 4, 2)))
+    moved = position.copy()
+    node = elements[7, 6]
+    moved[node] += share * (position[elements[7, 2]] - position[elements[7, 0]])
+    meshio.Mesh(moved, [("tetra10", elements)]).write(tmp_path / "block.vtu")
+    block, _ = part_meshes(spec, completed(spec.parameters, {}))
+    changed = np.flatnonzero((block.cells == node).any(axis=1))
+    told = (
+        f"{BLOCK}{len(changed)} elements get straight edges: as in the file they would turn a part of an element over"
+    )
+    assert list(block.notes) == ([told] if straight else [])
+    scale = np.ptp(block.position) / np.ptp(position)
+    np.testing.assert_allclose(block.position, scale * (position if straight else moved), atol=1e-6 * scale)
 
 
 @pytest.mark.parametrize("order", [1, 2])

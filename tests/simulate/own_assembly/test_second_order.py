@@ -67,6 +67,11 @@ def test_edges_that_turn_an_element_over_become_straight():
     assert (points_at_rest(bent, elements)[0] < 0).any()
     np.testing.assert_allclose(straightened(bent, elements), position, atol=1e-12)
     bent = position.copy()
+    bent[elements[5, 6]] += 0.3 * (position[elements[5, 2]] - position[elements[5, 0]])  # inside out at a corner alone
+    volume, at_rest = (points_at_rest(one, elements)[0] for one in (bent, position))
+    assert (volume > 0.3 * at_rest).all()
+    np.testing.assert_allclose(straightened(bent, elements), position, atol=1e-12)
+    bent = position.copy()
     bent[elements[5, 6]] += 0.05
     np.testing.assert_array_equal(straightened(bent, elements), bent)
 

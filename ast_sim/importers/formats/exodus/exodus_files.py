@@ -36,6 +36,7 @@ class ExodusFacts:
         kinds: for each block the kind of its elements and how many nodes each has.
         ids: the numbers of the blocks.
         steps: how many frames the file holds.
+        timed: whether it says their times.
         texts: names of texts that are stored in a way that VTK does not read.
         lacking: the first array of values of a variable at the nodes that is named, but not there; "" if none.
     """
@@ -43,6 +44,7 @@ class ExodusFacts:
     kinds: list[tuple[str, int]]
     ids: list[int]
     steps: int
+    timed: bool
     texts: list[str]
     lacking: str
 
@@ -66,7 +68,7 @@ def exodus_facts(path: Path) -> ExodusFacts | None:
     head = _head(path)
     try:
         return _facts(head.variables, lambda name: head.values(path, name), head.records or 0, [])
-    except (ValueError, IndexError, TypeError) as error:
+    except (ValueError, IndexError) as error:
         raise DatasetError(f"{path}: is cut off or damaged: {error}") from error
 
 
@@ -85,7 +87,8 @@ def _facts_of_hdf(file: h5py.File) -> ExodusFacts:
     arrays = {name: one for name, one in file.items() if isinstance(one, h5py.Dataset)}
     held = {"title": file.attrs, **{f"elem_type of {name}": one.attrs for name, one in arrays.items() if _CELLS(name)}}
     texts = [name for name, attrs in held.items() if _is_of_any_length(attrs, name.partition(" ")[0])]
-    steps = len(arrays["time_whole"]) if "time_whole" in arrays else 0
+    moving = [one for name, one in arrays.items() if name == "time_whole" or name.startswith("vals_")]
+    steps = max((one.shape[0] for one in moving), default=0)
     return _facts(arrays, lambda name: arrays[name][()], steps, texts)
 
 
@@ -99,7 +102,8 @@ def _facts(arrays: Mapping[str, Any], values: Callable[[str], np.ndarray], steps
     ids = values("eb_prop1").ravel().tolist() if "eb_prop1" in arrays else []
     count = arrays["name_nod_var"].shape[0] if steps and "name_nod_var" in arrays else 0
     wanted = [] if "vals_nod_var" in arrays else [f"vals_nod_var{number}" for number in range(1, count + 1)]
-    return ExodusFacts(kinds, ids, steps, texts, next((name for name in wanted if name not in arrays), ""))
+    lacking = next((name for name in wanted if name not in arrays), "")
+    return ExodusFacts(kinds, ids, steps, "time_whole" in arrays, texts, lacking)
 
 
 def node_numbers(path: Path) -> np.ndarray:
@@ -125,9 +129,12 @@ def _kind_of(cells: Any) -> tuple[str, int]:
     return (kind.decode("latin-1") if isinstance(kind, bytes) else str(kind)).strip("\0 "), int(cells.shape[-1])
 
 
-def require_whole_exodus(path: Path) -> None:
+def require_whole_exodus(path: Path) -> bool:
     """Check that an Exodus file of the classic NetCDF kind has the bytes that its head declares, that results do not go
     on in files with other meshes (job.e-s002 beside job.e), and that VTK reads the blocks as they are.
+
+    Returns:
+        Whether the file says the times of its frames: VTK counts them 0, 1, 2, ... where it does not.
 
     Raises:
         DatasetError: they do, or it is cut off: VTK takes zeros for what is missing; or VTK would take other nodes.
@@ -137,7 +144,7 @@ def require_whole_exodus(path: Path) -> None:
         raise DatasetError(f"{path}: goes on in {further[0].name} with another mesh; the mesh must not change")
     facts = exodus_facts(path)
     if facts is None:
-        return
+        return True
     wrong = [(kind, nodes) for kind, nodes in facts.kinds if nodes not in _NODES.get(kind[:3].upper(), (nodes,))]
     if wrong:
         kind, nodes = wrong[0]
@@ -158,3 +165,4 @@ def require_whole_exodus(path: Path) -> None:
             f"{path}: its {facts.texts[0]} is a text of any length (NC_STRING), and VTK reads characters (NC_CHAR):"
             " write it in letters of ASCII"
         )
+    return facts.timed

@@ -103,6 +103,8 @@ class _Parser:
         kind = self.kind()
         self.count()  # its bytes, which follow from its shape
         begin = self.number(self.place_format)
+        if begin < 0:
+            raise ValueError(f"{name} begins at {begin}")
         of_records = bool(shape) and shape[0] == 0  # the length of the dimension of the records
         return name, NetcdfVariable(tuple(shape[of_records:]), attributes, kind, begin, of_records)
 
