@@ -23,8 +23,8 @@ _WORDS = {
 }
 
 
-def require_complete(source: Path, trajectory: Trajectory, names: FieldNames) -> None:
-    """Check that nodes move and that some are prescribed.
+def require_complete(source: Path, trajectory: Trajectory, names: FieldNames, deck: Path | None = None) -> None:
+    """Check that nodes move, and that some are prescribed and some are not. Beside a deck no field needs a name.
 
     Raises:
         DatasetError: a model cannot learn from the simulation; the text names the fields that were not used, and the
@@ -32,7 +32,7 @@ def require_complete(source: Path, trajectory: Trajectory, names: FieldNames) ->
     """
     missing = _missing(trajectory)
     if missing:
-        unused = _unused(next(iter(frames(source))), names)
+        unused = _unused(next(iter(frames(source))), names) if deck is None else []
         named = ", ".join(f"{name} ({option})" for option, name in unused)
         options = " ".join(f"{option} {name}" for option, name in unused if "|" not in option)
         arguments = ", ".join(f"{option[2:]}={name!r}" for option, name in unused if "|" not in option)
@@ -52,6 +52,8 @@ def _missing(trajectory: Trajectory) -> list[str]:
     missing = []
     if not moves.any():
         missing.append("nothing moves")
+    elif scene.prescribed.all():
+        missing.append("all nodes are prescribed, so there is nothing to predict: mark fewer, or mesh finer")
     elif not moves[scene.node_type == NodeType.NORMAL].any() and trajectory.stress is None:
         missing.append("no free node moves and there is no stress, so there is nothing to learn from")
     if not scene.prescribed.any():

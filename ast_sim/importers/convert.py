@@ -164,7 +164,7 @@ def _trajectories(
         if name in decks:
             doubt_modulus(decks[name], trajectory, names.stress_unit or "Pa")
         if not incomplete:
-            require_complete(series[name], trajectory, names)
+            require_complete(series[name], trajectory, names, decks.get(name))
         if integration == "dynamic":
             _require_even_times(series[name], trajectory)
         if origin is None:

@@ -187,3 +187,28 @@ def test_endings_have_no_case(folder, tmp_path_factory, kind):
     source = find_series(files)["ALL"] if kind == "one of several" else source
     read = read_series(source, NAMES)
     np.testing.assert_allclose(read.position[:, :, 2].max(axis=1), (1, 0.9, 0.8, 0.7), rtol=1e-6)
+
+
+def listed_in(kind, folder, names):
+    """A PVD or .series file that lists these files."""
+    if kind == "pvd":
+        return pvd(folder, [(time, "", name) for time, name in enumerate(names)])
+    files = [{"name": name, "time": time} for time, name in enumerate(names)]
+    (folder / "all.vtu.series").write_text(json.dumps({"files": files}))
+    return folder / "all.vtu.series"
+
+
+@pytest.mark.parametrize("kind", ["pvd", "series"])
+@pytest.mark.parametrize(("real", "listed"), [("two words", "two%20words"), ("größe", "gr%C3%B6%C3%9Fe"), ("a", "%61")])
+def test_names_with_percent_signs_are_taken_as_they_stand(folder, kind, real, listed):
+    """As by ParaView: a browser's name of a file is another file, and is there no file of the name, it is refused."""
+    shutil.copytree(folder / "sub", folder / real)
+    source = listed_in(kind, folder, [f"{listed}/a_{frame}.vtu" for frame in range(4)])
+    with pytest.raises(DatasetError, match=f"lists .*/{listed}/a_0.vtu, which does not exist"):
+        read_series(source, NAMES)
+    (folder / listed).mkdir()
+    for frame in range(4):
+        shutil.copy(folder / f"a_{frame}.vtu", folder / listed)
+    np.testing.assert_allclose(read_series(source, NAMES).position[:, :, 2].max(axis=1), (1, 0.9, 0.8, 0.7), rtol=1e-6)
+    plain = listed_in(kind, folder, [f"{real}/a_{frame}.vtu" for frame in range(4)])
+    np.testing.assert_allclose(read_series(plain, NAMES).position[:, :, 2].max(axis=1), (1, 0.95, 0.9, 0.85), rtol=1e-6)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -48,7 +49,7 @@ _PROCEDURES = {
     *("COUPLEDTEMPERATURE-DISPLACEMENT", "UNCOUPLEDTEMPERATURE-DISPLACEMENT"),
 }
 _OUTPUT = {"NODEFILE", "NODEOUTPUT"}
-_READ = {"BOUNDARY", "RIGIDBODY", "STEP", "ENDSTEP", *_PROCEDURES, *MATERIAL_KEYWORDS}
+_READ = {"AMPLITUDE", "BOUNDARY", "RIGIDBODY", "STEP", "ENDSTEP", *_PROCEDURES, *MATERIAL_KEYWORDS}
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +97,8 @@ def read_job(path: Path) -> Job:
     """The job of a deck of CalculiX.
 
     Nodes are prescribed if *BOUNDARY holds them in all directions or moves them in one, or if they belong to a
-    *RIGID BODY whose reference node is prescribed. They are obstacles where a whole body is prescribed, else handles.
+    *RIGID BODY whose reference node is prescribed. They are obstacles where a whole body is prescribed in all
+    directions, else handles. How they move is in the results, so *AMPLITUDE is not needed.
 
     Raises:
         DatasetError: a line cannot be read, the deck has parts and instances, or its results are no positions of
@@ -236,24 +238,62 @@ def _node_type(mesh: SourceMesh, conditions: _Conditions) -> np.ndarray:
     if all(block.label.startswith(_PLANE) for block in mesh.blocks):
         held[:, 2] |= held[:, :2].any(axis=1)
     prescribed = held.all(axis=1) | conditions.moved | conditions.rigid
-    kept = np.zeros(len(mesh.points), bool)
+    kept, may_be_soft = (np.zeros(len(mesh.points), bool) for _ in range(2))
     pairs = [np.zeros((0, 2), np.int64)]
     for block in mesh.blocks:
+        if block.dimension == max(one.dimension for one in mesh.blocks):  # shells beside solids become obstacles
+            may_be_soft[block.nodes] = True
         kept[block.nodes if block.kind == "tetra10" else block.corners] = True
         rest = block.nodes[:, 1:]
         pairs.append(np.stack([np.repeat(block.nodes[:, 0], rest.shape[1]), rest.ravel()], axis=1))
     body = connected_parts(np.concatenate(pairs), len(mesh.points))
-    open_bodies = np.unique(body[kept & ~prescribed])
+    whole = kept & ~np.isin(body, body[kept & ~prescribed])
+    partly = kept & prescribed & ~conditions.rigid & ~held.all(axis=1)
+    soft = whole & np.isin(body, np.intersect1d(body[partly], body[may_be_soft]))
     types = np.where(prescribed, NodeType.HANDLE, NodeType.NORMAL).astype(np.uint8)
-    types[kept & ~np.isin(body, open_bodies)] = NodeType.OBSTACLE
-    sliding = kept & held.any(axis=1) & ~prescribed
+    types[whole & ~soft] = NodeType.OBSTACLE
+    turned = kept & conditions.turned & ~prescribed
+    sliding = kept & conditions.sometimes.any(axis=1) & ~prescribed & ~turned
+    mesh.notes.extend(_free_all_the_same(sliding, turned))
+    mesh.notes.extend(_moved_in_part(held, partly, conditions.own_axes))
+    if soft.any():
+        mesh.notes.append(
+            f"{counted(len(np.unique(body[soft])), 'body has', 'bodies have')} prescribed nodes only, some of them free"
+            f" along an axis: {counted(soft.sum(), 'node is a handle', 'nodes are handles')} there, not of a rigid tool"
+            " (as FieldNames(obstacle=NAME) or --obstacle NAME makes it), and at most a stress is predicted"
+        )
+    return types
+
+
+def _free_all_the_same(sliding: np.ndarray, turned: np.ndarray) -> Iterator[str]:
+    """Notes on nodes [n] that are held in some directions, and on shell nodes [n] that are turned."""
     if sliding.any():
-        conditions_note = (
+        yield (
             f"{counted(sliding.sum(), 'node is', 'nodes are')} held in some directions only (symmetry, sliding): they"
             " count as free"
         )
-        mesh.notes.append(conditions_note)
-    return types
+    if turned.any():
+        yield (
+            f"{counted(turned.sum(), 'node is', 'nodes are')} turned (directions 4 to 6 of *BOUNDARY): turns of nodes"
+            " are in no scene, so they count as free"
+        )
+
+
+def _moved_in_part(held: np.ndarray, partly: np.ndarray, own_axes: np.ndarray) -> Iterator[str]:
+    """A note for each set of axes along which nodes are free that are moved along another one.
+
+    Args:
+        held: [n, 3] the directions that are prescribed; `partly` [n] says at which nodes this is not all of them.
+        own_axes: [n] the nodes whose directions are the ones of *TRANSFORM.
+    """
+    for pattern in np.unique(np.column_stack([held, own_axes])[partly], axis=0):
+        nodes = partly & (held == pattern[:3]).all(axis=1) & (own_axes == pattern[3])
+        free = " and ".join(np.array([*"xyz"])[~pattern[:3]])
+        yield (
+            f"{counted(nodes.sum(), 'node is', 'nodes are')} moved, but free along {free}"
+            f"{' of *TRANSFORM' if pattern[3] else ''}: this motion is taken from the results, and a question must give"
+            " it"
+        )
 
 
 def _ends(deck: Deck) -> tuple[float, ...]:
@@ -274,6 +314,8 @@ def _ends(deck: Deck) -> tuple[float, ...]:
 def _not_in_a_scene(deck: Deck) -> list[str]:
     names = {keyword.name for keyword in deck.keywords}
     notes = []
+    if "AMPLITUDE" in names:
+        notes.append("*AMPLITUDE is not computed: nodes move as in the results")
     if names & _LOADS:
         notes.append(
             f"loads are not part of a scene and must be equal in all of them: {', '.join(sorted(names & _LOADS))}"

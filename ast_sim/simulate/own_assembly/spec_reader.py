@@ -262,7 +262,7 @@ def _places(table: Table, name: str) -> tuple[Place, ...]:
     except ValueError as error:
         raise ConfigError(
             f"{table.key(name)} = {text!r} cannot be read at {str(error)!r}; write for example 'zmin', 'xmin,xmax',"
-            " 'z<=2', '0<x<5 and y>1', 'field=NAME' or 'group=NAME'"
+            " 'z<=2', '0<x<5 and y>1', 'field=NAME', 'group=NAME' or 'group=\"A and B\"'"
         ) from error
 
 

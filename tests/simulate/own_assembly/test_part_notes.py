@@ -100,3 +100,37 @@ def test_the_parts_of_pairs_are_told_as_well(tmp_path, ending):
         told = "area"
     with pytest.warns(UserWarning, match=f"^part.{ending}: .*{told}"):
         part_source(path).check()
+
+
+LIKE_MPA = "{} is {} Pa; moduli are in pascal in every unit of length, and 1 MPa is 1e6"
+
+
+@pytest.mark.parametrize(
+    ("young", "told"),
+    [("1.0", "1"), ("999", "999"), ("[0.5, 1.5]", "1"), ("1000", None), ("[1e6, 2e6]", None)],
+    ids=["1 MPa", "just below", "drawn", "just not below", "pascal"],
+)
+@pytest.mark.parametrize("unit", ["mm", "m"])
+def test_a_modulus_that_is_meant_in_megapascal_is_told(tmp_path, young, told, unit):
+    """The punch is rigid and has none."""
+    spec = SPEC.replace("[1e6, 2e6]", young).replace('"mm"', f'"{unit}"')
+    attributes = case_of(write_assembly(tmp_path, spec)).attributes
+    note = LIKE_MPA.format("block.young", told)
+    assert attributes.get("notes", "") == (note if told else "")
+
+
+def test_each_part_and_each_yield_stress_in_megapascal_is_told(tmp_path):
+    soft = SPEC.replace("[1e6, 2e6]", "1.0").replace("rigid = true", "young = 210\npoisson = 0.3")
+    moved = soft.replace("translation = [0, 0, '-travel'] }", "where = 'zmax', translation = [0, 0, '-travel'] }")
+    notes = case_of(write_assembly(tmp_path, moved)).attributes["notes"]
+    assert notes.splitlines() == [LIKE_MPA.format("block.young", 1), LIKE_MPA.format("punch.young", 210)]
+    metal = 'young = 2e9\nlaw = "elastoplastic"\nhardening = [[30, 0], [40, 0.1]]'
+    notes = case_of(write_assembly(tmp_path, SPEC.replace("young = [1e6, 2e6]", metal))).attributes["notes"]
+    assert notes == LIKE_MPA.format("block.hardening", 30)
+
+
+def test_generate_tells_of_a_modulus_in_megapascal(tmp_path, capsys):
+    path = write_assembly(tmp_path, SPEC.replace("[1e6, 2e6]", "1.0"))
+    out = tmp_path / "d.h5"
+    assert cli.main(["generate", "assembly", str(path), "--out", str(out), "--count", "1", "--workers", "1"]) == 0
+    assert LIKE_MPA.format("block.young", 1) in "".join(capsys.readouterr())
