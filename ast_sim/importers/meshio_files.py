@@ -7,6 +7,7 @@ import io
 import re
 import tempfile
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +48,7 @@ def by_meshio(path: Path, copy: Path | None = None) -> SourceMesh:
     except (Exception, SystemExit) as error:
         told = what_meshio_says(error, printed.getvalue()).replace(str(file), str(path))
         raise DatasetError(f"{path}: cannot be read as a mesh: {told}; if it is whole, {INSTEAD}") from error
-    return from_meshio(mesh, path)
+    return replace(from_meshio(mesh, path), other_way=ending == ".med")
 
 
 @contextlib.contextmanager

@@ -1,4 +1,4 @@
-"""Figures that the README and the page on efforts repeat are the ones of the committed results."""
+"""Figures that the README and pages of the docs repeat are the ones of the committed results."""
 
 import json
 import re
@@ -8,9 +8,14 @@ from statistics import median
 from benchmarks.studies import clip_page
 
 ROOT = Path(__file__).parents[2]
-README, EFFORTS, SCENES = (
+README, EFFORTS, SCENES, OWN_DATA = (
     (ROOT / page).read_text(encoding="utf-8")
-    for page in ("README.md", "docs/how-to/choose-effort.md", "docs/how-to/predict-a-scene.md")
+    for page in (
+        "README.md",
+        "docs/how-to/choose-effort.md",
+        "docs/how-to/predict-a-scene.md",
+        "docs/how-to/own-data.md",
+    )
 )
 QUANTITIES = ("displacement", "reaction", "stress")
 
@@ -22,7 +27,7 @@ def results(name: str) -> dict:
 def numbers(pattern: str, page: str) -> tuple[float, ...]:
     """The numbers in the one place of a page that a pattern describes, whatever its line breaks."""
     (place,) = re.findall(pattern, " ".join(page.split()))
-    return tuple(map(float, (place,) if isinstance(place, str) else place))
+    return tuple(float(text.replace(",", "")) for text in ((place,) if isinstance(place, str) else place))
 
 
 def test_every_comparison_of_bands_is_counted():
@@ -83,3 +88,17 @@ def test_newton_steps_end_near_the_solver():
     of_scenes = [scene["relative_error"] for scene in results("jumps")["plates400_long"]["deepest"]["scenes"]]
     shown = (float(f"{100 * median(of_scenes):.1g}"), len(of_scenes))
     assert numbers(r"\(([\d.]+) % off in the median of (\d+) plates\)", SCENES) == shown
+
+
+def test_random_files_of_many_programs():
+    result = results("dialects")
+    counts = {name: sum(outcomes.values()) for name, outcomes in result["by dialect"].items()}
+    own = sum(count for name, count in counts.items() if result["programs"].get(name) == "own text")
+    shown = numbers(
+        r"([\d,]+) random simulations .*? FEniCS wrote ([\d,]+) of them; the other ([\d,]+) were decks", OWN_DATA
+    )
+    assert shown == (result["draws"], result["draws"] - own, own)
+    outcomes = result["outcomes"]
+    pattern = r"([\d,]+) came back right, .*?; ([\d,]+) were refused; none came back as something else"
+    assert numbers(pattern, OWN_DATA) == (outcomes["right"], outcomes["refused"])
+    assert outcomes["silent"] == outcomes["crash"] == 0

@@ -87,8 +87,9 @@ def write(path: Path, *meshes, groups=None, cell_groups=None) -> Path:
     ],
 )
 def test_cells_keep_their_nodes_and_their_volume(tmp_path, cells, nodes, elements, volume):
-    """The file counts the nodes of a cell the other way around than VTK."""
+    """The file counts the nodes of a cell the other way around than VTK, and nothing is told of that."""
     mesh = read_mesh(write(tmp_path / "a.med", cells()))
+    assert not any("inside out" in note for note in mesh.notes)
     assert (len(mesh.points), mesh.elements.shape) == (nodes, elements)
     corners = mesh.points[mesh.elements[:, :4]].astype(np.float64)
     volumes = np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6
@@ -96,6 +97,17 @@ def test_cells_keep_their_nodes_and_their_volume(tmp_path, cells, nodes, element
     for middle, (one, other) in enumerate([(0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3)][: 6 * (elements[1] == 10)]):
         halfway = (corners[:, one] + corners[:, other]) / 2
         np.testing.assert_allclose(mesh.points[mesh.elements[:, 4 + middle]], halfway, atol=1e-6)
+
+
+def test_a_cell_unlike_all_others_is_told(tmp_path):
+    path = write(tmp_path / "a.med", tetrahedra())
+    with h5py.File(path, "r+") as file:
+        numbers = []
+        file.visititems(lambda name, item: numbers.append(item) if name.endswith("TE4/NOD") else None)
+        nodes = numbers[0][()].reshape(4, -1)
+        nodes[:2, 0] = nodes[1::-1, 0]
+        numbers[0][()] = nodes.ravel()
+    assert read_mesh(path).notes == ["39 tetrahedra that were inside out are turned over"]
 
 
 def test_groups_may_overlap_and_have_any_letters(tmp_path):

@@ -113,6 +113,8 @@ class SourceMesh:
             None if it gives none.
         pieces: [n] int64, the piece of the file that each point belongs to; None if there is one.
         piece_names: the names of the pieces, "" for one without a name.
+        other_way: whether its format counts the nodes of a cell with a volume the other way around than VTK. Some
+            programs write it as VTK does.
     """
 
     path: Path
@@ -127,6 +129,7 @@ class SourceMesh:
     same_point: np.ndarray | None = None
     pieces: np.ndarray | None = None
     piece_names: tuple[str, ...] = ()
+    other_way: bool = False
 
     def require_consistent(self) -> None:
         """Check that cells refer to points that there are, that these are finite, and that each field has a row for

@@ -137,11 +137,15 @@ def _turned_over(
 
     The order of the nodes of a prism differs from program to program, so prisms are turned over without a note. Cells
     that are so warped that some of their tetrahedra are inside out fold over themselves; the check of the scene tells.
+    There is no note either if the format of the file counts the nodes of all cells the other way around.
     """
     corners = mesh.points[elements]
     negative = np.linalg.det(corners[:, 1:] - corners[:, :1]) < 0
     shape_of = np.repeat([block.shape for block in mesh.blocks], np.diff(starts))
-    plain = shape_of[rows] == "tetra"
+    of_elements = shape_of[rows]
+    if mesh.other_way and negative[of_elements != "wedge"].all():
+        return negative, []
+    plain = of_elements == "tetra"
     notes = []
     if (negative & plain).any():
         are = counted(

@@ -2,12 +2,14 @@
 
 `python -m benchmarks.robustness.dialects --json benchmarks/results/dialects.json`. Again and again a dialect is taken
 in turn, a simulation and a spelling are drawn, a program writes the files, and they are read as `convert` and `predict`
-read them. The outcomes:
+read them; `--corners` is drawn, too. The outcomes:
 
-- `right`: what comes back is what was written: nodes, tetrahedra, volumes, surfaces, bodies, named groups, frames in
-  their order, displacements, stresses, marks, times; and a note tells of each defect that was mended;
+- `right`: what comes back is what was written: nodes, the middles of edges too, tetrahedra, volumes, surfaces, bodies,
+  named groups, frames in their order, displacements, stresses, marks, times; a note tells of each defect that was
+  mended and of each cell that was cut or lost nodes; and nothing else is told: no other note, no warning, and nothing
+  looks wrong;
 - `refused`: one line says why;
-- `silent`: something else comes back, or a defect is mended without a word;
+- `silent`: something else comes back, a defect is mended without a word, or something is told without a reason;
 - `crash`: an exception that a user cannot act on, or an error of several lines.
 
 FEniCS writes with a Python of its own: `--fenics /usr/bin/python3` with Debian's python3-dolfinx and python3-dolfin.

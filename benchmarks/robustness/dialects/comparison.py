@@ -2,32 +2,21 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import KDTree
 
+from ast_sim.dataset.layout import CORNERS_ONLY
 from ast_sim.importers.mesh_file import read_mesh
 from ast_sim.importers.series import FieldNames, read_series
+from ast_sim.plausibility.motion import in_trajectory
+from ast_sim.plausibility.topology import at_rest
 from ast_sim.scene import NodeType, Scene, Trajectory
 from benchmarks.robustness.dialects.random_simulation import Simulation, corners_of
-
-# What was read may differ by this share of the largest value: files have six digits, scenes are float32.
-_SAME = 2e-5
-
-# The word that a note must hold if a file has a defect.
-_TOLD = {
-    "inside out": "turned over",
-    "twice": "taken once",
-    "unused": "of no element",
-    "unstitched": "joined",
-    "order": "another order",
-}
-
-
-class Wrong(Exception):
-    """What was read is not what was written."""
+from benchmarks.robustness.dialects.scene_nodes import SAME, Wrong, pairs_of
+from benchmarks.robustness.dialects.told import require_told
 
 
 @dataclass
@@ -38,51 +27,67 @@ class Case:
         names: the names of the fields, for a series; None: a mesh without frames.
         groups: the points of the simulation in each named group of the file.
         times: whether the file holds the times of the frames.
-        has_stress, has_marks: whether it holds them.
-        unit_displacement: the values read are compared with the displacement times this.
+        told: patterns of notes that must come beside the ones on cells and defects.
     """
 
     path: Path
     names: FieldNames | None = None
     groups: dict[str, np.ndarray] = field(default_factory=dict)
     times: bool = False
+    told: tuple[str, ...] = ()
 
 
 def check(case: Case, simulation: Simulation) -> None:
     """Read a case.
 
     Raises:
-        Wrong: something else comes back than what was written, or a defect is mended without a word.
+        Wrong: something else comes back than what was written, a defect is mended without a word, or something is told
+            that is not so: a note, a warning, or that something looks wrong.
         DatasetError: the file is refused.
     """
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        pairs, notes, looks_wrong = _compare(case, simulation)
+    require_told(simulation, pairs, case.told, notes)
+    told = [str(one.message) for one in warned if not issubclass(one.category, DeprecationWarning)]
+    if told or looks_wrong:
+        raise Wrong(f"without a reason it is warned: {'; '.join([*told, *looks_wrong])}")
+
+
+def _compare(case: Case, simulation: Simulation) -> tuple[np.ndarray, list[str], list[str]]:
+    """The nodes as in `pairs_of`, the notes, and what looks wrong."""
     if case.names is None:
-        mesh = read_mesh(case.path, corners=True)
+        mesh = read_mesh(case.path, corners=simulation.corners_only)
         scene, used = mesh.scene(None, None)
-        nodes = _check_scene(scene, mesh.points[used], simulation)
-        _check_groups(case, mesh.groups, used, nodes)
-        _require_notes(simulation, "; ".join(mesh.notes))
-        return
-    trajectory = read_series(case.path, case.names, corners=True)
+        pairs = _check_scene(scene, mesh.points[used], simulation)
+        _check_groups(case, mesh.groups, used, pairs)
+        _check_reduced(mesh.reduced, simulation)
+        return pairs, mesh.notes, list(map(str, at_rest(scene)))
+    trajectory = read_series(case.path, case.names, corners=simulation.corners_only)
     origin = np.array(trajectory.attributes.get("origin", [0.0, 0.0, 0.0]))
-    nodes = _check_scene(trajectory.scene, trajectory.scene.rest_position + origin, simulation)
-    _check_frames(case, trajectory, simulation, nodes)
-    _require_notes(simulation, str(trajectory.attributes.get("notes", "")))
+    pairs = _check_scene(trajectory.scene, trajectory.scene.rest_position + origin, simulation)
+    _check_frames(case, trajectory, simulation, pairs)
+    _check_reduced(CORNERS_ONLY in trajectory.attributes, simulation)
+    notes = str(trajectory.attributes.get("notes", ""))
+    return pairs, notes.split("; ") if notes else [], list(map(str, in_trajectory(trajectory)))
 
 
 def _check_scene(scene: Scene, points: np.ndarray, simulation: Simulation) -> np.ndarray:
-    """[N]: the point of the simulation that each node of the scene is."""
-    wanted = simulation.corners
-    if len(points) != len(wanted):
-        raise Wrong(f"{len(points)} nodes, not {len(wanted)}")
-    distance, row = KDTree(simulation.points[wanted]).query(points)
-    if distance.max() > _SAME * max(np.abs(simulation.points).max(), simulation.size) or len(set(row)) != len(row):
-        raise Wrong(f"nodes are off by {distance.max():g} of {simulation.size:g}")
-    nodes = wanted[row]
-    body = simulation.body_of_point[nodes]
+    """[N, 2]: the points of the simulation between which each node of the scene lies; see `pairs_of`."""
+    pairs = pairs_of(scene, points, simulation)
+    body = simulation.body_of_point[pairs[:, 0]]
     if len(set(zip(body.tolist(), scene.body.tolist(), strict=True))) != len(simulation.bodies):
         raise Wrong(f"{len(set(scene.body.tolist()))} bodies, not {len(simulation.bodies)}, or others")
-    _check_elements(nodes[scene.elements], simulation)
-    return nodes
+    _check_elements(pairs[scene.elements[:, :4], 0], simulation)
+    return pairs
+
+
+def _check_reduced(reduced: bool, simulation: Simulation) -> None:
+    """Forces of elements that have lost nodes are wrong, and the reader must know it."""
+    whole = {"tetra10"} if simulation.ten_nodes else set()
+    curved = {kind for kind in simulation.kinds - whole if kind[-1].isdigit()}
+    if reduced != bool(curved):
+        raise Wrong(f"{'elements' if reduced else 'no elements'} are said to keep their corners only")
 
 
 def _check_elements(tetrahedra: np.ndarray, simulation: Simulation) -> None:
@@ -112,37 +117,33 @@ def _check_elements(tetrahedra: np.ndarray, simulation: Simulation) -> None:
             raise Wrong(f"body {number} has a surface of {area[on == number].sum():g}: its cuts do not fit")
 
 
-def _check_frames(case: Case, trajectory: Trajectory, simulation: Simulation, nodes: np.ndarray) -> None:
-    wanted = simulation.displacement[:, nodes]
+def _check_frames(case: Case, trajectory: Trajectory, simulation: Simulation, pairs: np.ndarray) -> None:
+    wanted = simulation.displacement[:, pairs].mean(axis=2)
     if len(trajectory.position) != len(wanted):
         raise Wrong(f"{len(trajectory.position)} frames, not {len(wanted)}")
     moved = trajectory.position.astype(np.float64) - trajectory.scene.rest_position
-    allowed = _SAME * (np.abs(wanted).max() + np.abs(simulation.points).max())
+    allowed = SAME * (np.abs(wanted).max() + np.abs(simulation.points).max())
     if np.abs(moved - wanted).max() > allowed:
         raise Wrong(f"displacements are off by {np.abs(moved - wanted).max():g} of {np.abs(wanted).max():g}")
-    types = np.where(simulation.tool, NodeType.OBSTACLE, np.where(simulation.fixed, NodeType.HANDLE, NodeType.NORMAL))
-    if not np.array_equal(types[nodes], trajectory.scene.node_type):
+    tool, fixed = (marks[pairs].all(axis=1) for marks in (simulation.tool, simulation.fixed))
+    types = np.where(tool, NodeType.OBSTACLE, np.where(fixed, NodeType.HANDLE, NodeType.NORMAL))
+    if not np.array_equal(types, trajectory.scene.node_type):
         raise Wrong("other nodes are obstacles or handles")
     assert case.names is not None
     if case.names.stress is not None:
-        stress = simulation.stress[:, nodes]
-        if trajectory.stress is None or np.abs(trajectory.stress[:, :, 0] - stress).max() > _SAME * stress.max():
+        stress = simulation.stress[:, pairs].mean(axis=2)
+        if trajectory.stress is None or np.abs(trajectory.stress[:, :, 0] - stress).max() > SAME * stress.max():
             raise Wrong("the stress is another one")
     if case.times and (trajectory.times is None or not np.allclose(trajectory.times, simulation.times, rtol=1e-5)):
         raise Wrong(f"the times are {trajectory.times}, not {simulation.times.tolist()}")
 
 
-def _check_groups(case: Case, groups: dict[str, np.ndarray], used: np.ndarray, nodes: np.ndarray) -> None:
+def _check_groups(case: Case, groups: dict[str, np.ndarray], used: np.ndarray, pairs: np.ndarray) -> None:
     for name, wanted in case.groups.items():
         key = next((known for known in groups if known.casefold() == name.casefold()), None)
         if key is None:
             raise Wrong(f"there is no group {name!r}; there are {sorted(groups)}")
-        read = set(nodes[np.isin(used, groups[key])].tolist())
-        if read != set(np.intersect1d(wanted, nodes).tolist()):
-            raise Wrong(f"the group {name!r} has {len(read)} nodes, not {len(np.intersect1d(wanted, nodes))}")
-
-
-def _require_notes(simulation: Simulation, notes: str) -> None:
-    for defect in simulation.defects:
-        if _TOLD[defect] not in notes:
-            raise Wrong(f"no word on what is {defect!r}: {notes}")
+        read = np.isin(used, groups[key])
+        inside = np.isin(pairs, wanted).all(axis=1)
+        if (read != inside).any():
+            raise Wrong(f"the group {name!r} has {read.sum()} nodes, not {inside.sum()}, or others")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -12,7 +13,7 @@ import numpy as np
 from ast_sim.importers.series import FieldNames
 from benchmarks.robustness.dialects import deck_dialects, other_programs, vtk_dialects
 from benchmarks.robustness.dialects.comparison import Case
-from benchmarks.robustness.dialects.random_simulation import Body, Simulation, draw_simulation
+from benchmarks.robustness.dialects.random_simulation import Body, Simulation, bend_edges, draw_simulation
 
 LINEAR = ("tetra", "tetra", "hexahedron", "wedge", "pyramid")
 ALL = (*LINEAR, "tetra10", "tetra10", "hexahedron20", "wedge15", "pyramid13")
@@ -52,9 +53,12 @@ DIALECTS = {
 
 
 def draw(name: str, seed: int, folder: Path) -> tuple[Simulation, Case]:
-    """A simulation, and its files in a dialect."""
-    dialect, rng = DIALECTS[name], np.random.default_rng(seed)
+    """A simulation, and its files in a dialect. A second stream of random numbers draws what concerns the nodes in the
+    middles of edges, and leaves the other draws as they are."""
+    dialect, rng, second = DIALECTS[name], np.random.default_rng(seed), np.random.default_rng([seed, 10])
     simulation = draw_simulation(rng, dialect.kinds, int(rng.integers(2, 5)))
+    simulation.corners_only = bool(second.random() < 0.3)
+    bend_edges(second, simulation)
     simulation.defects = {defect for defect in dialect.defects if rng.random() < 0.2}
     if not any(kind.startswith("tetra") for kind in simulation.kinds):
         simulation.defects.discard("inside out")
@@ -88,5 +92,16 @@ def _of_fenics(folder: Path) -> Iterator[tuple[Simulation, Case]]:
     for path in sorted(folder.glob("*")):
         if path.name in ("all.pvd", "all.xdmf", "mesh.xdmf"):
             simulation = Simulation([body], displacement, np.zeros(displacement.shape[:2]), truth["times"], fixed)
+            corners = points[cells]
+            if cells.shape[1] == 4 and (np.linalg.det(corners[:, 1:] - corners[:, :1]) < 0).any():
+                simulation.defects.add("inside out")
+            if path.suffix == ".pvd" and any(map(_lists_twice, folder.glob("*.pvtu"))):
+                simulation.defects |= {"twice", "unstitched"}
             series = path.stem == "all"
             yield simulation, Case(path, names if series else None, times=series)
+
+
+def _lists_twice(path: Path) -> bool:
+    """Whether a .pvtu lists a piece twice, as dolfinx does where it writes two functions."""
+    pieces = re.findall(r'<Piece Source="(.*?)"', path.read_text())
+    return len(set(pieces)) < len(pieces)

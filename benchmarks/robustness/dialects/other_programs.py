@@ -16,6 +16,7 @@ from benchmarks.robustness.dialects.comparison import Case
 from benchmarks.robustness.dialects.deck_dialects import TYPES
 from benchmarks.robustness.dialects.file_content import FileContent, content_of
 from benchmarks.robustness.dialects.random_simulation import Simulation
+from benchmarks.robustness.dialects.told import told_of_order
 from benchmarks.robustness.dialects.vtk_dialects import NAMES, frame_names
 
 # Gmsh's types of elements, and where the nodes of its order stand in VTK's.
@@ -28,6 +29,7 @@ _GMSH_ORDER = {
 # The kinds that Gmsh does not leave out of files of other formats.
 _PLAIN = {"tetra", "hexahedron"}
 _GMSH_WRITES = {".inp": _PLAIN | {"wedge"}, ".vtk": _PLAIN | {"wedge"}, ".med": _PLAIN | {"wedge"}, ".mesh": _PLAIN}
+_HEADING = ("ignored keywords: HEADING",)  # of a deck
 _GROUP_NAMES = ["body {}", "pad and tool {}", "a, b {}", "Körper_{}", "B{}"]
 
 
@@ -47,7 +49,7 @@ def gmsh_mesh(rng: np.random.Generator, simulation: Simulation, folder: Path) ->
     simulation.defects.discard("unused")
     if version == 4.1 or ending != ".msh":
         simulation.defects.discard("twice")
-    return Case(path, groups=groups if ending == ".msh" else {})
+    return Case(path, groups=groups if ending == ".msh" else {}, told=_HEADING if ending == ".inp" else ())
 
 
 def _model(rng: np.random.Generator, content: FileContent, pattern: str) -> dict[str, np.ndarray]:
@@ -99,7 +101,8 @@ def meshio_series(rng: np.random.Generator, simulation: Simulation, folder: Path
     content, moved = content_of(rng, simulation), bool(rng.random() < 0.3)
     legacy = rng.random() < 0.4
     (folder / "series").mkdir()
-    for frame, name in enumerate(frame_names(rng, simulation, ".vtk" if legacy else ".vtu")[0]):
+    names = frame_names(rng, simulation, ".vtk" if legacy else ".vtu")
+    for frame, name in enumerate(names):
         shown = content.in_order(rng) if "order" in simulation.defects and frame else content
         mesh, path = _mesh(shown, simulation, frame, moved), folder / "series" / name
         if legacy:
@@ -109,7 +112,7 @@ def meshio_series(rng: np.random.Generator, simulation: Simulation, folder: Path
             mesh.write(path, file_format="vtu", binary=False)
         else:
             mesh.write(path, file_format="vtu", compression=rng.choice([None, "zlib", "lzma"]))
-    return Case(folder / "series", NAMES)
+    return Case(folder / "series", NAMES, told=told_of_order(names, False))
 
 
 def xdmf_series(rng: np.random.Generator, simulation: Simulation, folder: Path) -> Case:
@@ -142,7 +145,7 @@ def meshio_mesh(rng: np.random.Generator, simulation: Simulation, folder: Path) 
     except (meshio.WriteError, KeyError, AssertionError):  # it does not write these cells or numbers there
         path = folder / "mesh.vtu"
         mesh.write(path)
-    return Case(path)
+    return Case(path, told=_HEADING if path.suffix == ".inp" else ())
 
 
 def calculix_series(rng: np.random.Generator, simulation: Simulation, folder: Path) -> Case:
@@ -172,8 +175,8 @@ def calculix_series(rng: np.random.Generator, simulation: Simulation, folder: Pa
     (folder / "job.inp").write_text("\n".join(lines) + "\n")
     subprocess.run(["ccx", "job"], cwd=folder, check=True, capture_output=True, timeout=60)
     bodies = sorted({body for body, _, _ in content.blocks})
-    corners = simulation.corners
-    lowest = [np.argmax(np.isin(content.point_of, corners[simulation.body_of_point[corners] == b])) for b in bodies]
+    nodes = simulation.nodes
+    lowest = [np.argmax(np.isin(content.point_of, nodes[simulation.body_of_point[nodes] == b])) for b in bodies]
     number = dict(zip(np.argsort(lowest).tolist(), range(len(bodies)), strict=True))
     tools = [body for body in bodies if simulation.bodies[body].tool]
     simulation.fixed = (simulation.body_of_point == 0) & _at_low_x(simulation)

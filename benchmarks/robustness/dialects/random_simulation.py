@@ -48,6 +48,7 @@ class Simulation:
         times: [S].
         fixed: [n] bool, prescribed points of bodies that deform.
         defects: what the file shall have: "inside out", "twice", "unused", "unstitched", "order".
+        corners_only: whether the reader is told to take the corners only of tetrahedra of ten nodes.
     """
 
     bodies: list[Body]
@@ -56,6 +57,7 @@ class Simulation:
     times: np.ndarray
     fixed: np.ndarray
     defects: set[str] = field(default_factory=set)
+    corners_only: bool = False
 
     @property
     def points(self) -> np.ndarray:
@@ -86,8 +88,19 @@ class Simulation:
 
     @property
     def corners(self) -> np.ndarray:
-        """The points that are corners of cells, ascending: the nodes of the scene."""
+        """The points that are corners of cells, ascending."""
         return np.unique(np.concatenate([cells[:, : corners_of(kind)].ravel() for _, kind, cells in self.blocks]))
+
+    @property
+    def ten_nodes(self) -> bool:
+        """Whether the elements of the scene have ten nodes."""
+        return "tetra10" in self.kinds and not self.corners_only
+
+    @property
+    def nodes(self) -> np.ndarray:
+        """The points that are nodes of the scene, ascending."""
+        middles = [cells.ravel() for _, kind, cells in self.blocks if kind == "tetra10" and self.ten_nodes]
+        return np.unique(np.concatenate([self.corners, *middles]))
 
     @property
     def size(self) -> float:
@@ -124,6 +137,21 @@ def draw_simulation(rng: np.random.Generator, kinds: tuple[str, ...], frames: in
     times = np.cumsum(rng.uniform(0.01, 1, frames)) - 0.01
     fixed = (points[:, 0] <= points[:, 0].min() + 1e-6 * scale) & ~tool
     return Simulation(bodies, displacement, stress, times, fixed)
+
+
+def bend_edges(rng: np.random.Generator, simulation: Simulation) -> None:
+    """Move the nodes in the middles of edges within bricks of tetrahedra of ten nodes, by a few percent of the edge."""
+    for body in simulation.bodies:
+        for kind, cells in body.blocks:
+            if kind == "tetra10":
+                middles, first = np.unique(cells[:, 4:], return_index=True)
+                ends = body.points[cells[:, MIDDLES[kind]].reshape(-1, 2)[first]]
+                low, high = body.points.min(axis=0), body.points.max(axis=0)
+                margin = 1e-3 * (high - low)
+                at = body.points[middles]
+                inner = ((at > low + margin) & (at < high - margin)).all(axis=1)
+                length = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)[:, None]
+                body.points[middles[inner]] += (rng.uniform(-0.05, 0.05, at.shape) * length)[inner]
 
 
 def _brick(rng: np.random.Generator, cells: np.ndarray, kind: str, tool: bool) -> Body:

@@ -20,6 +20,7 @@ from ast_sim.importers.series import FieldNames
 from benchmarks.robustness.dialects.comparison import Case
 from benchmarks.robustness.dialects.file_content import FileContent, content_of, cut_into_pieces
 from benchmarks.robustness.dialects.random_simulation import Simulation
+from benchmarks.robustness.dialects.told import told_of_order
 
 TYPES = {
     "tetra": 10, "hexahedron": 12, "wedge": 13, "pyramid": 14,
@@ -72,6 +73,14 @@ def grid(
     return data
 
 
+def _told_of_parts(grids: list[Any]) -> tuple[str, ...]:
+    """A pattern of the note on cells that lack a field that the cells of other grids have."""
+    lacking = [data.GetNumberOfCells() for data in grids if not data.GetCellData().HasArray("part")]
+    if len(lacking) in (0, len(grids)):
+        return ()
+    return (f"the field 'part' is missing in some blocks: it is NaN in {sum(lacking)} rows?",)
+
+
 def add_time(data: Any, time: float) -> None:
     _add(data.GetFieldData(), "TimeValue", np.array([time]))
 
@@ -104,24 +113,24 @@ def write_xml(rng: np.random.Generator, path: Path, data: Any) -> None:
     assert writer.Write() == 1
 
 
-def frame_names(rng: np.random.Generator, simulation: Simulation, ending: str) -> tuple[list[str], bool]:
-    """Names of the files of the frames, and whether they say the order of time."""
+def frame_names(rng: np.random.Generator, simulation: Simulation, ending: str) -> list[str]:
+    """Names of the files of the frames, in order of time, which their numbers say."""
     frames = len(simulation.times)
     style = rng.integers(0, 4)
     if style == 0:
-        return [f"f{number}{ending}" for number in range(frames)], True
+        return [f"f{number}{ending}" for number in range(frames)]
     if style == 1:
         first = int(rng.integers(0, 12))
-        return [f"case_{first + number}{ending}" for number in range(frames)], True
+        return [f"case_{first + number}{ending}" for number in range(frames)]
     if style == 2:
-        return [f"Result-{time:.4f}".rstrip("0").rstrip(".") + ending for time in simulation.times], True
-    return [f"t{time:.3e}{ending}" for time in simulation.times], True
+        return [f"Result-{time:.4f}".rstrip("0").rstrip(".") + ending for time in simulation.times]
+    return [f"t{time:.3e}{ending}" for time in simulation.times]
 
 
 def vtu_series(rng: np.random.Generator, simulation: Simulation, folder: Path) -> Case:
     """A folder of VTU files; some hold their times, and then their names may say nothing."""
     content, moved = content_of(rng, simulation), bool(rng.random() < 0.3)
-    names, timed = frame_names(rng, simulation, ".vtu")[0], bool(rng.random() < 0.5)
+    names, timed = frame_names(rng, simulation, ".vtu"), bool(rng.random() < 0.5)
     if timed and rng.random() < 0.3:
         names = [f"{name}.vtu" for name in rng.permutation(["u", "a", "zz", "k7", "b"])[: len(names)]]
     upper = rng.random() < 0.1
@@ -132,7 +141,7 @@ def vtu_series(rng: np.random.Generator, simulation: Simulation, folder: Path) -
         if timed:
             add_time(data, simulation.times[frame])
         write_xml(rng, folder / "series" / (name[:-4] + ".VTU" if upper else name), data)
-    return Case(folder / "series", NAMES, times=timed)
+    return Case(folder / "series", NAMES, times=timed, told=told_of_order(names, timed))
 
 
 def pvd_series(rng: np.random.Generator, simulation: Simulation, folder: Path) -> Case:
@@ -141,18 +150,20 @@ def pvd_series(rng: np.random.Generator, simulation: Simulation, folder: Path) -
     pieces = [content.part(rows) for rows in cut_into_pieces(rng, content, True)] if by_part else [content]
     slash = "\\" if rng.random() < 0.5 else "/"
     (folder / "frames").mkdir()
-    entries = []
+    entries, first = [], []
     for frame, time in enumerate(simulation.times.tolist()):
         for part, piece in enumerate(pieces):
             name = f"f{frame}_{part}.vtu"
-            write_xml(rng, folder / "frames" / name, grid(rng, piece, simulation, frame, False))
+            data = grid(rng, piece, simulation, frame, False)
+            first += [data] if frame == 0 else []
+            write_xml(rng, folder / "frames" / name, data)
             entries.append(f'<DataSet timestep="{time!r}" part="{part}" file="frames{slash}{name}"/>')
     listed = "\n".join(entries[row] for row in rng.permutation(len(entries))) if not by_part else "\n".join(entries)
     ending = ".PVD" if rng.random() < 0.1 else ".pvd"
     head = '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1"><Collection>'
     text = f"{head}\n{listed}\n</Collection></VTKFile>\n"
     (folder / f"all{ending}").write_text(text.replace("\n", "\r\n" if slash == "\\" else "\n"), newline="")
-    return Case(folder / f"all{ending}", NAMES, times=True)
+    return Case(folder / f"all{ending}", NAMES, times=True, told=_told_of_parts(first))
 
 
 def pieces_series(rng: np.random.Generator, simulation: Simulation, folder: Path) -> Case:
@@ -210,14 +221,15 @@ def legacy_series(rng: np.random.Generator, simulation: Simulation, folder: Path
     """A folder of legacy files of the versions 4.2 and 5.1, as text or binary."""
     content = content_of(rng, simulation)
     (folder / "series").mkdir()
-    for frame, name in enumerate(frame_names(rng, simulation, ".vtk")[0]):
+    names = frame_names(rng, simulation, ".vtk")
+    for frame, name in enumerate(names):
         writer = vtkUnstructuredGridWriter()
         writer.SetFileVersion(42 if rng.random() < 0.5 else 51)
         (writer.SetFileTypeToBinary if rng.random() < 0.5 else writer.SetFileTypeToASCII)()
         writer.SetFileName(str(folder / "series" / name))
         writer.SetInputData(grid(rng, content, simulation, frame, False))
         assert writer.Write() == 1
-    return Case(folder / "series", NAMES)
+    return Case(folder / "series", NAMES, told=told_of_order(names, False))
 
 
 class _Frames(VTKPythonAlgorithmBase):
@@ -269,7 +281,8 @@ def blocks_mesh(rng: np.random.Generator, simulation: Simulation, folder: Path) 
         assert writer.Write() == 1
         return Case(folder / "mesh.vtkhdf")
     blocks = vtkMultiBlockDataSet()
-    for number, rows in enumerate(cut_into_pieces(rng, content, True)):
-        blocks.SetBlock(number, grid(rng, content.part(rows), simulation, 0, False))
+    grids = [grid(rng, content.part(rows), simulation, 0, False) for rows in cut_into_pieces(rng, content, True)]
+    for number, data in enumerate(grids):
+        blocks.SetBlock(number, data)
     write_xml(rng, folder / "mesh.vtm", blocks)
-    return Case(folder / "mesh.vtm")
+    return Case(folder / "mesh.vtm", told=_told_of_parts(grids))
