@@ -20,6 +20,7 @@ from .inference.trade import Trade as Trade
 from .inference.trade import trade as trade
 from .inference.trained_run import Run as Run
 from .material import Material as Material
+from .mechanics.permanent_set import PermanentSet as PermanentSet
 from .mechanics.physics_check import PhysicsCheck as PhysicsCheck
 from .named_field import NamedField as NamedField
 from .ops.library import keep_memory as keep_memory

@@ -274,7 +274,7 @@ def _add_predict(predict: Parser) -> None:
     add_each(predict, {"--num-frames N": about}, type=at_least(2))
     about = "report what is physically impossible: elements turned over, penetration, forces out of balance"
     predict.add_argument("--check", action="store_true", help=about)
-    about = "also write the force and the torque on each body, frame by frame, as a table"
+    about = "also write the force and the torque on each body, frame by frame, and a permanent set, as a table"
     add_each(predict, {"--forces FILE.csv": about}, type=path)
     mesh = predict.add_argument_group("if SCENE is a mesh")
     about = "number of a rigid body; may be repeated"
@@ -309,7 +309,8 @@ def _add_sweep(sweep: Parser) -> None:
     add_each(sweep, {"--set NAME=VALUES": about}, action="append", default=[])
     add_each(sweep, {"--table FILE": "in place of --set: a CSV file, whose first line names the parameters"}, type=path)
     about = "what the picture shows (default: reaction)"
-    sweep.add_argument("--quantity", choices=("reaction", "largest_stress"), default="reaction", help=about)
+    quantities = ("reaction", "largest_stress", "permanent_set")
+    sweep.add_argument("--quantity", choices=quantities, default="reaction", help=about)
     add_effort(sweep, "as for predict")
     add_each(sweep, {"--nodes N": NODES}, type=at_least(1))
 

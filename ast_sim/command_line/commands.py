@@ -293,6 +293,7 @@ def sweep(args: argparse.Namespace) -> None:
 
 def _save(answer: Any, args: argparse.Namespace, truth: Any) -> None:
     """Write an answer; say how long it took, or why it ended early."""
+    from ast_sim.inference.quantities.forces_and_figures import told_sets
     from ast_sim.number_arrays import measured_time
 
     answer.save(args.out, truth)
@@ -300,7 +301,7 @@ def _save(answer: Any, args: argparse.Namespace, truth: Any) -> None:
         raise RolloutError(f"{answer.failure}, in {args.out}")
     steps = len(answer.step_seconds)
     print(f"{args.out}: {steps} frame{'' if steps == 1 else 's'} predicted in {measured_time(answer.seconds)}")
-    print("".join(f"{line}\n" for line in answer.how_far), end="")
+    print("".join(f"{line}\n" for line in (*answer.how_far, *told_sets(answer))), end="")
     if args.forces is not None:
         answer.save_forces(args.forces)
     if args.check:

@@ -13,12 +13,14 @@ import numpy as np
 from ast_sim.dataset.layout import DatasetInfo
 from ast_sim.dataset.writer import DatasetWriter
 from ast_sim.inference.quantities.answered_frame import AnsweredFrame
-from ast_sim.inference.quantities.band import LEVEL, Band, band_of, how_far
+from ast_sim.inference.quantities.band import Band, band_of, how_far
+from ast_sim.inference.quantities.facts_of_answers import facts_of
 from ast_sim.inference.quantities.forces_and_figures import (
     BodyForce,
     figures_of,
     force_on,
     forces_on_bodies,
+    sets_of_answer,
     write_figures,
     write_forces,
 )
@@ -26,9 +28,9 @@ from ast_sim.inference.quantities.frames_of_answers import require_frames, time_
 from ast_sim.inference.quantities.relative_errors import errors_of, require_same_motion
 from ast_sim.mechanics.driven import Driven
 from ast_sim.mechanics.linearised.linearised_contact import STILL
+from ast_sim.mechanics.permanent_set import PermanentSet
 from ast_sim.mechanics.physics_check import Law, PhysicsCheck, check_physics
 from ast_sim.named_field import NamedField
-from ast_sim.number_arrays import percent
 from ast_sim.scene import AttributeValue, Scene, Trajectory
 from ast_sim.support.argument_checks import file_name
 from ast_sim.support.errors import AstSimError, MissingExtra, RolloutError
@@ -109,33 +111,16 @@ class Answer:
         """[S] bool: the frames that were predicted, not given."""
         return np.array(self.frames, np.int64) >= self.given
 
-    def _facts(self) -> dict[str, str]:
-        unit = "" if self.info is None else f" {self.info.length_unit}"
-        moved = np.linalg.norm(self.displacement[:, self.scene.deforming_nodes], axis=2)
-        band = self.band()
-        return {
-            "name": self.name,
-            "frames": ", ".join(map(str, self.frames[:10])) + (", ..." if len(self.frames) > 10 else ""),
-            "nodes": f"{self.scene.num_nodes:,}",
-            "largest displacement": f"{moved.max(initial=0.0):.4g}{unit}",
-            "largest stress": "none" if self.stress is None else f"{self.stress.max(initial=0.0):.4g} Pa",
-            "expected error": "not known" if self.expected_error is None else percent(self.expected_error),
-            "converged": {None: "no Newton steps", True: "yes", False: "no"}[self.converged],
-            **({} if band is None else {f"band ({100 * LEVEL:g} %)": f"{band.max():.3g}{unit}"}),
-            "seconds": f"{self.seconds:.3g}",
-            **({} if self.failure is None else {"failure": self.failure}),
-        }
-
     def __repr__(self) -> str:
-        return one_line("Answer", self._facts())
+        return one_line("Answer", facts_of(self))
 
     def _repr_html_(self) -> str:
         try:
             file = io.BytesIO()
             self.plot().savefig(file, format="png", dpi=96)
-            return html_table("Answer", self._facts(), html_picture(file.getvalue(), 400))
+            return html_table("Answer", facts_of(self), html_picture(file.getvalue(), 400))
         except (MissingExtra, RolloutError):  # a table is better than nothing
-            return html_table("Answer", self._facts())
+            return html_table("Answer", facts_of(self))
 
     @property
     def displacement(self) -> np.ndarray:
@@ -288,14 +273,21 @@ class Answer:
         return forces_on_bodies(self)
 
     def save_forces(self, path: str | os.PathLike[str]) -> None:
-        """Write `body_forces` as a table (.csv): frame, time, body, force_x, ... [N], torque_x, ... [N m].
+        """Write `body_forces` as a table (.csv): frame, time, body, force_x, ... [N], torque_x, ... [N m]; and where
+        there is a `permanent_set`, its largest and its mean displacement in the row of its frame and body.
 
         Raises:
             ConfigError: as in `reaction`.
             AstSimError: there is no frame, the suffix is another one, or the file cannot be written.
         """
         require_frames(self, "save")
-        write_forces(file_name(path, "path"), self.body_forces())
+        write_forces(file_name(path, "path"), self.body_forces(), self.permanent_set())
+
+    def permanent_set(self) -> list[PermanentSet]:
+        """The displacement that is left in each body that yields, if all prescribed nodes are back at rest in the last
+        frame of the answer; else none. A body that is held while other nodes of it are driven is not let go: it has
+        none."""
+        return sets_of_answer(self)
 
     def check(self) -> PhysicsCheck:
         """Is it physics? Elements turned over, penetration, the forces out of balance: the worst over the computed
@@ -311,7 +303,8 @@ class Answer:
     def figures(self, origin: Sequence[float] = (0.0, 0.0, 0.0)) -> list[dict[str, float]]:
         """What an engineer asks of each frame: the travel of the prescribed nodes, the reaction and its components (if
         `reaction` knows it), the largest stress and where it is (if the model predicts one), the largest number of
-        each named field (of several columns: the largest norm), the size of the last Newton step (if any was made).
+        each named field (of several columns: the largest norm), the largest `permanent_set` (in the last frame, if
+        there is one), the size of the last Newton step (if any was made).
 
         Args:
             origin: [3] the point that positions are relative to.

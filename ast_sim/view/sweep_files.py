@@ -16,7 +16,11 @@ from ast_sim.view.files import explained
 from ast_sim.view.picture import INK
 
 Row = Mapping[str, Any]
-QUANTITIES = {"reaction": ("Reaction", "N"), "largest_stress": ("Largest von Mises stress", "Pa")}
+QUANTITIES = {
+    "reaction": ("Reaction", "N"),
+    "largest_stress": ("Largest von Mises stress", "Pa"),
+    "permanent_set": ("Largest permanent set", ""),  # the picture names the unit of all lengths
+}
 MOST_CURVES = 12
 
 

@@ -46,9 +46,9 @@ def test_every_error_that_is_named_can_be_caught(reference):
 
 
 def test_what_public_methods_return_has_a_section(reference):
-    results = ["AnsweredFrame", "BodyForce", "Figures", "Generated", "NamedField", "PhysicsCheck", "SceneMesh", "Sweep"]
+    results = ["AnsweredFrame", "BodyForce", "Figures", "Generated", "NamedField", "PermanentSet", "PhysicsCheck"]
     api = reference.api()
-    assert all(f"## `ast_sim.{name}`" in api for name in results)
+    assert all(f"## `ast_sim.{name}`" in api for name in [*results, "SceneMesh", "Sweep"])
     assert "BodyForce(frame: int, time: float | None, body: int, force: np.ndarray, torque: np.ndarray)" in api
 
 

@@ -80,7 +80,9 @@ def test_plastic_strain_and_forces_are_predicted(data, tmp_path, capsys):
     states = ["--state", "PEEQ", "--state", "reaction"]
     assert cli.main(["train", str(data), "--out", str(run), "--model", "transolver", *states, *settings]) == 0
     options = ["--split", "train", "--index", "0", "--out", str(out), "--forces", str(forces)]
+    capsys.readouterr()
     assert cli.main(["predict", str(run), str(data), *options]) == 0
+    said = re.findall(r"^permanent set of body (\d): (\S+) mm at most, (\S+) mm on av", capsys.readouterr().out, re.M)
     with Dataset(data) as dataset, Dataset(out) as answers:
         truth, answer = dataset["train"][0], answers["test"][0]
     scene = truth.scene
@@ -105,6 +107,14 @@ def test_plastic_strain_and_forces_are_predicted(data, tmp_path, capsys):
     assert 0.3 * DOWN < dents[0][deepest, 2] < 0.9 * DOWN
     assert dents[1][deepest, 2] == pytest.approx(dents[0][deepest, 2], rel=0.15)
     assert relative(dents[1], dents[0]) < 0.15
+    # The answer says so without a hand: of the pad, since the punch does not yield.
+    true, left = (np.linalg.norm(dent[~scene.prescribed[pad]], axis=1) for dent in dents)
+    assert [body for body, *_ in said] == ["0"]
+    largest, mean = map(float, said[0][1:])
+    assert (largest, mean) == pytest.approx((left.max(), left.mean()), rel=5e-3)
+    assert (largest, mean) == pytest.approx((true.max(), true.mean()), rel=0.2)
+    assert float(told[-2]["permanent_set"]) == pytest.approx(largest, rel=5e-3)
+    assert [row["permanent_set"] for row in told].count("") == len(told) - 1
     # The law of a body that yields is not known, so the predicted reactions give the force on the driven nodes.
     again = ast_sim.Run(run).predict(truth)
     np.testing.assert_allclose(again.reaction()[:, 2], [float(row["force_z"]) for row in told[1::2]], rtol=1e-5)

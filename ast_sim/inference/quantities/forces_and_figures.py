@@ -1,4 +1,4 @@
-"""What an engineer asks of an answer: the forces on its bodies from outside, and figures of each frame.
+"""What an engineer asks of an answer: the forces on its bodies from outside, the permanent set, figures of each frame.
 
 A model may predict the nodal reactions of its data. They are summed over the prescribed nodes, since free nodes have
 none. Otherwise, and after Newton steps, forces follow from the positions, if the law of the material is known and
@@ -17,6 +17,7 @@ from ast_sim.dataset.layout import LENGTH_UNITS
 from ast_sim.inference.quantities.frames_of_answers import time_of
 from ast_sim.mechanics.driven import Driven
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean
+from ast_sim.mechanics.permanent_set import PermanentSet, permanent_sets
 from ast_sim.named_field import REACTION
 from ast_sim.number_arrays import plain_array, three_numbers
 from ast_sim.support.errors import AstSimError, ConfigError, SimulationError, counted, warn
@@ -135,18 +136,42 @@ def forces_on_bodies(answer: Answer) -> list[BodyForce]:
     return sorted(rows, key=lambda row: (answer.frames.index(row.frame), row.body))
 
 
-def write_forces(path: Path, forces: list[BodyForce]) -> None:
-    """Write a table (.csv) with a row for each frame and body; errors as in `Answer.save_forces`."""
+def sets_of_answer(answer: Answer) -> list[PermanentSet]:
+    """See `Answer.permanent_set`."""
+    moves_on = answer.given > 1  # by inertia, whatever the prescribed nodes do
+    if answer.law is None or answer.driven is None or moves_on or not answer.frames:
+        return []
+    last = max(answer.frames)
+    position = answer.position[answer.frames.index(last)]
+    return permanent_sets(answer.scene, answer.law.material, answer.driven, position, last)
+
+
+def told_sets(answer: Answer) -> list[str]:
+    """The permanent set of each body as a sentence."""
+    unit = "" if answer.info is None else f" {answer.info.length_unit}"
+    return [
+        f"permanent set of body {one.body}: {one.largest:.3g}{unit} at most, {one.mean:.3g}{unit} on average over its"
+        f" free nodes (frame {one.frame})"
+        for one in answer.permanent_set()
+    ]
+
+
+def write_forces(path: Path, forces: list[BodyForce], sets: list[PermanentSet]) -> None:
+    """Write a table (.csv) with a row for each frame and body; errors as in `Answer.save_forces`.
+
+    A permanent set stands in the row of its frame and body. A body without prescribed nodes has no other row."""
     if path.suffix != ".csv":
         raise AstSimError(f"{path}: the name of a table of forces must end in .csv")
-    rows = []
+    rows: dict[tuple[int, int], dict[str, float | None]] = {}
     for one in forces:
-        row = {"frame": one.frame, "time": one.time, "body": one.body}
+        row = rows[one.frame, one.body] = {"frame": one.frame, "time": one.time, "body": one.body}
         for name, values in (("force", one.force), ("torque", one.torque)):
             row |= {f"{name}_{axis}": float(value) for axis, value in zip("xyz", values, strict=True)}
-        rows.append(row)
+    for left in sets:
+        row = rows.setdefault((left.frame, left.body), {"frame": left.frame, "body": left.body})
+        row |= {"permanent_set": left.largest, "mean_permanent_set": left.mean}
     make_folder(path.parent)
-    sweep_files.write_table(path, rows)
+    sweep_files.write_table(path, list(rows.values()))
 
 
 def write_figures(path: Path, answer: Answer) -> None:
@@ -168,6 +193,7 @@ def figures_of(answer: Answer, origin: Sequence[float]) -> list[dict[str, float]
         forces = None
     computed = sorted(number for number in answer.frames if number >= answer.given)
     last_steps = dict(zip(computed, answer.last_steps, strict=False))
+    sets = answer.permanent_set()
     for frame, position in enumerate(answer.position):
         travel = np.linalg.norm((position - scene.rest_position)[scene.prescribed], axis=1)
         row = {"travel_of_nodes": float(travel.max(initial=0.0))}
@@ -186,6 +212,8 @@ def figures_of(answer: Answer, origin: Sequence[float]) -> list[dict[str, float]
                 values = one.values[frame]
                 size = values if values.shape[1] == 1 else np.linalg.norm(values, axis=1)
                 row |= {f"largest_{name}": float(size.max())}
+        if sets and answer.frames[frame] == sets[0].frame:
+            row |= {"permanent_set": max(one.largest for one in sets)}
         if answer.frames[frame] in last_steps:
             row |= {"last_newton_step": last_steps[answer.frames[frame]]}
         rows.append(row)

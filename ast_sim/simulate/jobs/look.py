@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from ast_sim.mechanics.case import SolidCase
+from ast_sim.mechanics.permanent_set import set_of_body
 from ast_sim.scene import NodeType, Trajectory
 from ast_sim.simulate.families import assembly
 from ast_sim.simulate.jobs.mesh_error import MeshError, mesh_error
@@ -104,10 +105,13 @@ def outcome(spec: AssemblySpec, solved: Trajectory) -> str:
     peak = f"peak force {force.max():.3g} N"
     if force[-1] > UNLOADED * force.max():
         return f"{peak}; {force[-1]:.3g} N act in the last frame: no permanent set before the parts are let go"
-    yielding = [number for number, part in enumerate(spec.parts) if part.hardening]
-    free = np.isin(solved.scene.body, yielding) & ~solved.scene.prescribed
-    travel = np.linalg.norm(solved.position[:, free] - solved.position[0, free], axis=2).max(axis=1)
-    return f"{peak}, permanent set {travel[-1]:.3g} {spec.unit} of {travel.max():.3g} {spec.unit}"
+    free = set(solved.scene.body[~solved.scene.prescribed].tolist())
+    yielding = [number for number, part in enumerate(spec.parts) if part.hardening and number in free]
+    largest = [
+        max((set_of_body(solved.scene, body, way, frame).largest for body in yielding), default=0.0)
+        for frame, way in enumerate(solved.position - solved.position[0])
+    ]
+    return f"{peak}, permanent set {largest[-1]:.3g} {spec.unit} of {max(largest):.3g} {spec.unit}"
 
 
 def _lines(spec: AssemblySpec, case: SolidCase) -> Iterator[str]:
