@@ -121,7 +121,8 @@ def test_the_layer_turns_with_its_shell(tmp_path):
         progress=lambda done, total, line: told.append(line),
     )
     assert told == [
-        f"test: a, 4 frames of {N + 50} nodes; 32 cells of the kind triangle are shells and become obstacles"
+        f"test: a, 4 frames of {N + 50} nodes; 32 cells of the kind triangle are shells and become obstacles;"
+        " no times tell the 4 frames apart: they count 0, 1, 2, ..."
     ]
     with Dataset(tmp_path / "d.h5") as dataset:
         assert np.array_equal(dataset.load("test", 0).position, found.position)
