@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 from statistics import median
 
-from benchmarks.studies import clip_page
+from benchmarks.studies import clip_page, example_meshes
 
 ROOT = Path(__file__).parents[2]
 README, EFFORTS, SCENES, OWN_DATA = (
@@ -75,6 +75,13 @@ def test_both_sides_of_the_clip_pay_beside_the_same_solver():
     page = clip_page.page(results("clip"))
     counts = numbers(r"in the dataset, the run pays after (\d+) questions, the Gaussian process, .*?after (\d+)", page)
     assert numbers(r"after (\d+) predictions, the Gaussian process its simulations after (\d+)", README) == counts
+
+
+def test_the_meshes_of_the_examples():
+    shown = numbers(r"the force is at most ([\d.]+) % \(hook\) and ([\d.]+) % \(bumper", README)
+    rows = results("example_meshes")
+    off = [100 * example_meshes.largest_off(rows[name]) for name in ("snap_hook", "bumper")]
+    assert shown == tuple(round(value, 1) for value in off) and max(off) < 5
 
 
 def test_the_error_of_the_mesh_that_a_trade_estimates():
