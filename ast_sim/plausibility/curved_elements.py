@@ -75,5 +75,6 @@ def _not_positive(coefficients: np.ndarray) -> np.ndarray:
         owner = np.tile(owner, len(_EIGHTHS))
         wrong[owner[(parts[_CORNERS] <= limit[owner]).any(axis=0)]] = True
         left = ~wrong[owner] & (parts <= limit[owner]).any(axis=0)
-        owner, parts = owner[left], parts[:, left]
+        owner = owner[left]
+        parts = parts[:, left]
     return wrong

@@ -109,3 +109,20 @@ def test_random_files_of_many_programs():
     pattern = r"([\d,]+) came back right, .*?; ([\d,]+) were refused; none came back as something else"
     assert numbers(pattern, OWN_DATA) == (outcomes["right"], outcomes["refused"])
     assert outcomes["silent"] == outcomes["crash"] == 0
+
+
+def test_the_decks_of_calculix():
+    result = results("ccx_decks")
+    read = {name: row["elements of"] for name, row in result["rows"].items() if "read" in row}
+    alone = sum(kinds == ["solids"] for kinds in read.values())
+    beside = sum("solids" in kinds for kinds in read.values()) - alone
+    pattern = (
+        r"the (\d+) decks with which CalculiX .*? 2.11\) (\d+) are read: all (\d+) that hold solids alone, all (\d+)"
+        r" with .*?, and (\d+) of shells or plane elements.*? in (\d+) of them"
+    )
+    counts = (result["decks"], len(read), alone, beside, len(read) - alone - beside, result["alike"])
+    assert numbers(pattern, OWN_DATA) == counts and result["silent"] == []
+    refused = result["refused, by elements"]
+    pattern = r"Refused are (\d+) networks of fluid or heat, (\d+) of beams, three of springs or trusses, and one that"
+    assert numbers(pattern, OWN_DATA) == (refused["networks"], refused["beams"])
+    assert (refused["springs or trusses"], refused["none"]) == (3, 1)

@@ -48,7 +48,10 @@ def check(case: Case, simulation: Simulation) -> None:
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
         pairs, notes, looks_wrong = _compare(case, simulation)
-    require_told(simulation, pairs, case.told, notes)
+    frames = len(simulation.displacement)
+    without_times = case.names is not None and not case.times and frames > 1
+    of_times = (rf"no times tell the {frames} frames apart: they count 0, 1, 2, \.\.\.",) if without_times else ()
+    require_told(simulation, pairs, (*case.told, *of_times), notes)
     told = [str(one.message) for one in warned if not issubclass(one.category, DeprecationWarning)]
     if told or looks_wrong:
         raise Wrong(f"without a reason it is warned: {'; '.join([*told, *looks_wrong])}")
