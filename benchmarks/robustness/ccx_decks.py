@@ -30,6 +30,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ast_sim.importers.mesh_file import MeshFile, read_mesh
+from ast_sim.simulate.calculix.solve import find_ccx
 from ast_sim.support.disk import write_json
 from ast_sim.support.errors import AstSimError
 from ast_sim.support.provenance import provenance
@@ -121,7 +122,7 @@ def by_calculix(deck: Path) -> Mesh | None:
     job = deck.with_name(f"listed_{deck.stem}.inp")
     job.write_text("\n".join([*_of_mesh(text.splitlines()), *_LIST]) + "\n", "latin-1")
     try:
-        subprocess.run(["ccx", job.stem], cwd=deck.parent, capture_output=True, timeout=_SECONDS)
+        subprocess.run([find_ccx(), job.stem], cwd=deck.parent, capture_output=True, timeout=_SECONDS)
     except subprocess.TimeoutExpired:
         return None
     result = job.with_suffix(".frd")

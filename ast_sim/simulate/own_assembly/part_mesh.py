@@ -208,7 +208,17 @@ def _from_file(part: PartSpec, request: dict[str, Any]) -> PartMesh:
         return _surface_mesh(part, request, replace(surface, notes=(*told, *surface.notes)))
     mesh = PartMesh(request["name"], position, elements, groups, fields, notes)
     mesh = _raised(mesh) if request["order"] == 2 and elements.shape[1] == 4 else mesh
-    return _checked(_halved(mesh) if request["halved"] else mesh, part.rigid, from_file=True)
+    mesh = _halved(mesh) if request["halved"] else mesh
+    return _with_note_of_edges(_checked(mesh, part.rigid), mesh)
+
+
+def _with_note_of_edges(checked: PartMesh, mesh: PartMesh) -> PartMesh:
+    """The checked mesh of a file, with a note if edges of it have become straight."""
+    changed = int((checked.position != mesh.position).any(axis=1)[checked.cells].any(axis=1).sum())
+    if not changed:
+        return checked
+    get = f"{mesh.name}: {counted(changed, 'element gets', 'elements get')} straight edges"
+    return replace(checked, notes=(*checked.notes, f"{get}: as in the file they would turn a part of an element over"))
 
 
 def _halved(mesh: PartMesh) -> PartMesh:
@@ -248,8 +258,8 @@ def _surface_mesh(part: PartSpec, request: dict[str, Any], surface: TriangleSurf
     return _checked(mesh, part.rigid)
 
 
-def _checked(mesh: PartMesh, rigid: bool, from_file: bool = False) -> PartMesh:
-    """The mesh after all checks, its tetrahedra of positive volume. A note says which edges of a file become straight.
+def _checked(mesh: PartMesh, rigid: bool) -> PartMesh:
+    """The mesh after all checks, its tetrahedra of positive volume.
 
     Raises:
         BadMesh: it cannot be used.
@@ -268,7 +278,4 @@ def _checked(mesh: PartMesh, rigid: bool, from_file: bool = False) -> PartMesh:
             cells = oriented(position, cells)
         position = straightened(position, cells) if cells.shape[1] == 10 else position
     check_mesh(position, cells, mesh.name, SMALLEST_ANGLE)
-    changed = int((position != mesh.position).any(axis=1)[cells].any(axis=1).sum())
-    get = f"{mesh.name}: {counted(changed, 'element gets', 'elements get')} straight edges"
-    notes = (f"{get}: as in the file they would turn a part of an element over",) if changed and from_file else ()
-    return PartMesh(mesh.name, position, cells, mesh.groups, mesh.fields, (*mesh.notes, *notes))
+    return PartMesh(mesh.name, position, cells, mesh.groups, mesh.fields, mesh.notes)
