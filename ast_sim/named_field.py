@@ -14,6 +14,7 @@ from ast_sim.support.notebook_table import one_line
 
 # The name of the nodal reactions, [S, N, 3] in newton: the forces that act on the nodes from outside.
 REACTION = "reaction"
+PLASTIC_STRAIN = "PEEQ"  # the name of the equivalent plastic strain, as CalculiX and Abaqus have it
 STRESS = "stress"  # the name of the von Mises stress among what a model predicts
 LOCATIONS = ("node", "element")
 

@@ -286,7 +286,8 @@ class Answer:
     def permanent_set(self) -> list[PermanentSet]:
         """The displacement that is left in each body that yields, if all prescribed nodes are back at rest in the last
         frame of the answer; else none. A body that is held while other nodes of it are driven is not let go: it has
-        none."""
+        none. A body yields if its material has a yield stress; if the data have none, if its predicted plastic strain
+        (PEEQ) exceeds 0.2 %."""
         return sets_of_answer(self)
 
     def check(self) -> PhysicsCheck:

@@ -8,8 +8,10 @@ import numpy as np
 
 from ast_sim.material import YIELD_STRESS, Material
 from ast_sim.mechanics.driven import Driven
+from ast_sim.named_field import NamedField
 from ast_sim.scene import Scene
 
+OFFSET = 2e-3  # the plastic strain by which the yield stress of metal is usually defined
 BACK = 1e-3  # nodes are back if they are no farther off, as a share of the way that the driven nodes went
 
 
@@ -42,18 +44,28 @@ def set_of_body(scene: Scene, body: int, way: np.ndarray, frame: int) -> Permane
     return PermanentSet(frame, body, float(lengths.max()), float(lengths.mean()))
 
 
-def yielding_bodies(scene: Scene, material: Material) -> list[int]:
-    """The bodies with free nodes and with an element whose yield stress is above 0; none if the material has no yield
-    stress."""
-    if not material.yields:
+def yielding_bodies(scene: Scene, material: Material, strain: NamedField | None) -> list[int]:
+    """The bodies with free nodes that yield: those with an element whose yield stress is above 0. If the material names
+    no yield stress, those with a plastic strain above `OFFSET`.
+
+    Args:
+        scene: the scene.
+        material: names the numbers of the scene's material.
+        strain: the equivalent plastic strain in one frame; None: it is not known.
+    """
+    body_of_element = scene.body[scene.elements[:, 0]]
+    if material.yields:
+        yields = np.broadcast_to(material.numbers(YIELD_STRESS, scene.material), scene.num_elements) > 0
+        bodies = body_of_element[yields]
+    elif strain is not None:
+        bodies = (scene.body if strain.location == "node" else body_of_element)[strain.values[0].max(axis=1) > OFFSET]
+    else:
         return []
-    yields = np.broadcast_to(material.numbers(YIELD_STRESS, scene.material), scene.num_elements) > 0
-    free = set(scene.body[~scene.prescribed].tolist())
-    return sorted(free & set(scene.body[scene.elements[yields]].ravel().tolist()))
+    return sorted(set(scene.body[~scene.prescribed].tolist()) & set(bodies.tolist()))
 
 
 def permanent_sets(
-    scene: Scene, material: Material, driven: Driven, position: np.ndarray, frame: int
+    scene: Scene, yielding: list[int], driven: Driven, position: np.ndarray, frame: int
 ) -> list[PermanentSet]:
     """The permanent set of each body that yields, if a frame shows it.
 
@@ -62,7 +74,7 @@ def permanent_sets(
 
     Args:
         scene: the scene.
-        material: names the numbers of the scene's material.
+        yielding: the bodies that yield.
         driven: the driven nodes, with their path in the whole motion.
         position: [N, 3], the positions in the frame.
         frame: the number of the frame in the motion.
@@ -72,5 +84,5 @@ def permanent_sets(
     if not travel or np.linalg.norm(way[scene.prescribed], axis=1).max(initial=0.0) > BACK * travel:
         return []
     strained = scene.prescribed & ~driven.nodes & (scene.body == driven.body)
-    bodies = [body for body in yielding_bodies(scene, material) if body != driven.body or not strained.any()]
+    bodies = [body for body in yielding if body != driven.body or not strained.any()]
     return [set_of_body(scene, body, way, frame) for body in bodies]

@@ -8,7 +8,7 @@ from typing import Any, Self
 
 from ast_sim.batches.scheme import Scheme
 from ast_sim.models.data_facts import DataFacts
-from ast_sim.named_field import REACTION, Output
+from ast_sim.named_field import PLASTIC_STRAIN, REACTION, Output
 from ast_sim.support.errors import ConfigError
 from ast_sim.support.toml_settings import FROM_DATA, LARGEST, known, require_range
 
@@ -122,10 +122,11 @@ class ModelConfig:
 
     def usual_inputs(self, facts: DataFacts, jumps: bool) -> tuple[str, ...]:
         """The inputs of nodes if `node_inputs` is unset: velocity in dynamic scenes, material in scenes that have one,
-        and with jumps the elastic forces of tetrahedra, or the history where the material yields."""
+        and with jumps the elastic forces of tetrahedra, or the history where the material yields: it has a yield
+        stress, or the plastic strain is predicted."""
         velocity = ("velocity",) if facts.dynamic else ()
         material = ("material",) if facts.material_width else ()
-        if jumps and facts.material.yields:
+        if jumps and (facts.material.yields or PLASTIC_STRAIN in self.state):
             return (*velocity, *material, "history")
         forces = ("out_of_balance",) if jumps and facts.tetrahedra else ()
         return (*velocity, *material, *forces)

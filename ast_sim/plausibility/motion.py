@@ -1,6 +1,7 @@
 """What looks wrong in the frames of a simulation: tools that change their shape, displacements in other units, elements
 that turn over, frames that stop dead, bodies that change their places, displacements from the frame before, no motion,
-Poisson's ratios, yield stresses and stresses that cannot be one, contact that no model can see.
+Poisson's ratios, yield stresses and stresses that cannot be one, plastic strains of elastic bodies, contact that no
+model can see.
 
 Legend: S frames, N nodes, E elements.
 """
@@ -17,6 +18,7 @@ from ast_sim.number_arrays import point
 from ast_sim.plausibility.body_places import change_places
 from ast_sim.plausibility.findings import Finding, places
 from ast_sim.plausibility.increments import counted_from_frame_before
+from ast_sim.plausibility.plastic_strain import plastic_but_elastic
 from ast_sim.plausibility.topology import at_rest
 from ast_sim.plausibility.units import yielding
 from ast_sim.scene import Scene, Trajectory
@@ -50,6 +52,7 @@ def in_trajectory(trajectory: Trajectory, dynamic: bool = False) -> list[Finding
         *at_rest(scene),
         *_poisson(trajectory),
         *yielding(trajectory),
+        *plastic_but_elastic(trajectory),
         *_still(scene, position),
         *_far(scene, position),
         *_soft_tools(scene, position),

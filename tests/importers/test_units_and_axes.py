@@ -10,6 +10,7 @@ from varied_sets import simulation, turned, varied_set
 
 from ast_sim.importers.convert import convert
 from ast_sim.importers.series import FieldNames, read_series
+from ast_sim.named_field import NamedField
 from ast_sim.plausibility.across import AcrossSimulations
 from ast_sim.plausibility.motion import in_trajectory
 from ast_sim.support.errors import DatasetError
@@ -131,6 +132,27 @@ def test_a_yield_stress_that_cannot_be_one_is_told(share, count):
     )
     findings = [finding.what for finding in in_trajectory(one)]
     assert findings.count("elements whose yield stress cannot be one") == count
+
+
+@pytest.mark.parametrize("at", ["node", "element"])
+def test_a_plastic_strain_of_an_elastic_body_is_told(at):
+    """A yield stress explains it; so does a material of which Young's modulus is not known."""
+    one = several(1, material=STEEL)[0]
+    rows = one.scene.num_elements
+    strained = np.zeros((one.num_frames, rows if at == "element" else one.scene.num_nodes, 1), np.float32)
+    strained[-1, [2, 3] if at == "element" else one.scene.elements[2]] = 1e-3
+    one = replace(one, fields={"PEEQ": NamedField(strained, at)})
+    what = "elements with a plastic strain, but without a yield stress"
+    told = [finding for finding in in_trajectory(one) if finding.what == what]
+    assert [(one.count, one.places) for one in told] == [(2, "elements 2, 3") if at == "element" else (1, "elements 2")]
+    young = one.scene.material[:, 0]
+    for limit, count in ((3e8, 0), (0, len(told))):
+        material = np.column_stack([one.scene.material, np.full(rows, limit)]).astype(np.float32)
+        named = {"material": "young, poisson, yield_stress"}
+        metal = replace(one, scene=replace(one.scene, material=material), attributes=named)
+        assert [finding.what for finding in in_trajectory(metal)].count(what) == count
+    number = replace(one, scene=replace(one.scene, material=young[:, None]), attributes={"material": "number"})
+    assert what not in [finding.what for finding in in_trajectory(number)]
 
 
 def written(folder, order=(0, 1, 2), pascals=1.0, cells=(2, 2, 1), press=0.1):

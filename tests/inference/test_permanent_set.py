@@ -11,7 +11,7 @@ from ast_sim import Material
 from ast_sim.inference.answer import Answer
 from ast_sim.inference.quantities.forces_and_figures import told_sets
 from ast_sim.mechanics.driven import Driven
-from ast_sim.mechanics.permanent_set import BACK
+from ast_sim.mechanics.permanent_set import BACK, OFFSET
 from ast_sim.mechanics.physics_check import Law
 from ast_sim.named_field import REACTION, NamedField
 from ast_sim.scene import NodeType
@@ -110,6 +110,19 @@ def test_bodies_that_do_not_yield_have_none():
     assert not pressed(stress=0).permanent_set()
     elastic = replace(pressed(), law=Law(Material(("young", "poisson", "number")), 0.0))
     assert not elastic.permanent_set() and not replace(elastic, law=None).permanent_set()
+
+
+@pytest.mark.parametrize("at", ["node", "element"])
+def test_without_a_yield_stress_bodies_with_a_plastic_strain_have_one(at):
+    """As in results of Abaqus, which have no material: with as much strain as defines a yield stress, in that frame."""
+    answer = replace(pressed(), law=None)
+    body = answer.scene.body if at == "node" else answer.scene.body[answer.scene.elements[:, 0]]
+    for frame, strain, count in ((LAST, 1.01 * OFFSET, 1), (LAST, 0.99 * OFFSET, 0), (LAST - 1, 1.01 * OFFSET, 0)):
+        values = np.zeros((LAST + 1, len(body), 1), np.float32)
+        values[frame, np.flatnonzero(body == PLATE)[5]] = strain
+        left = replace(answer, fields={"PEEQ": NamedField(values, at)}).permanent_set()
+        assert [one.body for one in left] == [PLATE] * count
+    assert left == [] != pressed().permanent_set()
 
 
 def test_with_inertia_there_is_none():

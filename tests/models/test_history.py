@@ -47,9 +47,9 @@ def data(tmp_path_factory):
     return path
 
 
-def small(data, folder, steps=1, **changes):
+def small(data, folder, steps=1, state=("PEEQ",), **changes):
     settings = {"hidden": 32, "d_token": 32, "heads": 1, "L_SA": 1, "ffn_inner": 32, "num_tokens": 32, **changes}
-    return train(data, folder / "run", state=["PEEQ"], model_settings=settings, steps=steps, batch_size=8, shift=0.0)
+    return train(data, folder / "run", state=state, model_settings=settings, steps=steps, batch_size=8, shift=0.0)
 
 
 def set_of(run, depth: float, frames=(LAST,)) -> float:
@@ -133,13 +133,24 @@ def test_a_history_needs_jumps(data, tmp_path):
         small(data, tmp_path, jumps=False, node_inputs=["history"])
 
 
+def test_where_a_plastic_strain_is_predicted_the_history_counts_without_a_yield_stress(tmp_path):
+    """As in results of Abaqus, which have no material."""
+    with toy.DatasetWriter(tmp_path / "d.h5", toy.info()) as writer:
+        for split in ("train", "valid"):
+            truth = pressed(0.05)
+            writer.add(split, replace(truth, scene=replace(truth.scene, material=None)))
+    run = small(tmp_path / "d.h5", tmp_path)
+    assert run.settings.model.node_inputs == ("displacement", "proximity", "history")
+    assert [output.name for output in run.settings.model.history] == ["stress", "PEEQ"]
+
+
 def test_elastic_scenes_have_no_history(tmp_path):
     with toy.DatasetWriter(tmp_path / "d.h5", replace(toy.info(), generator={"material": METAL[:2]})) as writer:
         for split in ("train", "valid"):
             truth = pressed(0.05)
             material = truth.scene.material[:, :2].copy()
             writer.add(split, replace(truth, scene=replace(truth.scene, material=material)))
-    run = small(tmp_path / "d.h5", tmp_path)
+    run = small(tmp_path / "d.h5", tmp_path, state=())
     assert run.settings.model.node_inputs == ("displacement", "proximity", "material", "out_of_balance")
     with Dataset(tmp_path / "d.h5") as dataset:
         batch, _ = run.model.pairs(dataset, batch_size=6).batch(0)

@@ -15,10 +15,11 @@ import numpy as np
 
 from ast_sim.dataset.layout import LENGTH_UNITS
 from ast_sim.inference.quantities.frames_of_answers import time_of
+from ast_sim.material import Material
 from ast_sim.mechanics.driven import Driven
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean
-from ast_sim.mechanics.permanent_set import PermanentSet, permanent_sets
-from ast_sim.named_field import REACTION
+from ast_sim.mechanics.permanent_set import PermanentSet, permanent_sets, yielding_bodies
+from ast_sim.named_field import PLASTIC_STRAIN, REACTION
 from ast_sim.number_arrays import plain_array, three_numbers
 from ast_sim.support.errors import AstSimError, ConfigError, SimulationError, counted, warn
 from ast_sim.view import sweep_files
@@ -139,11 +140,17 @@ def forces_on_bodies(answer: Answer) -> list[BodyForce]:
 def sets_of_answer(answer: Answer) -> list[PermanentSet]:
     """See `Answer.permanent_set`."""
     moves_on = answer.given > 1  # by inertia, whatever the prescribed nodes do
-    if answer.law is None or answer.driven is None or moves_on or not answer.frames:
+    if answer.driven is None or moves_on or not answer.frames:
         return []
     last = max(answer.frames)
-    position = answer.position[answer.frames.index(last)]
-    return permanent_sets(answer.scene, answer.law.material, answer.driven, position, last)
+    row = answer.frames.index(last)
+    strain = answer.fields.get(PLASTIC_STRAIN)
+    yielding = yielding_bodies(
+        answer.scene,
+        Material() if answer.law is None else answer.law.material,
+        None if strain is None else strain.select([row]),
+    )
+    return permanent_sets(answer.scene, yielding, answer.driven, answer.position[row], last)
 
 
 def told_sets(answer: Answer) -> list[str]:

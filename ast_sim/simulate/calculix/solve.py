@@ -26,7 +26,7 @@ from ast_sim.mechanics.contact_and_friction import Contact
 from ast_sim.mechanics.elements.elasticity import Elasticity
 from ast_sim.mechanics.elements.neo_hookean import von_mises
 from ast_sim.mechanics.elements.second_order import deforming_body
-from ast_sim.named_field import REACTION, NamedField
+from ast_sim.named_field import PLASTIC_STRAIN, REACTION, NamedField
 from ast_sim.scene import AttributeValue, Trajectory
 from ast_sim.simulate.calculix.ccx_results import Results, read_results
 from ast_sim.simulate.calculix.deck import Increments, contact_stiffness, write_deck
@@ -34,7 +34,6 @@ from ast_sim.support.errors import MissingExtra, SimulationError
 
 JOB = "case"
 POINTS = {4: 1, 10: 4}  # of integration, by the number of nodes of an element
-PLASTIC_STRAIN = "PEEQ"  # the name of the field, as CalculiX and Abaqus have it
 BEST_GUESS = "best solution and residuals are in the frd file"
 FAILED = 201  # what ccx returns when it gives up, for whatever reason
 # These are tried one after another until all frames converge: first softer contact, then shorter increments, too.
