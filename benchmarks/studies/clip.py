@@ -1,10 +1,10 @@
 """A metal clip that a ram bends open and lets go: the permanent set, and the peak force on the ram.
 
 `python -m benchmarks.studies.clip` solves scenes of `examples/clip` by CalculiX, trains a run on them and asks it for
-test scenes, beside a Gaussian process that maps the drawn parameters to both numbers, and beside CalculiX on other
-meshes and with larger increments. It writes benchmarks/results/clip.json, docs/results/clip.md and
-examples/clip/test_scenes.h5. Data and run lie in `--folder`; a second call goes on with what is there. Everything runs
-on one thread, and all times are processor times.
+test scenes and for clips with a cutout that no training scene has, beside a Gaussian process that maps the drawn
+parameters to both numbers, and beside CalculiX on other meshes and with larger increments. It writes
+benchmarks/results/clip.json, docs/results/clip.md and examples/clip/test_scenes.h5. Data and run lie in `--folder`; a
+second call goes on with what is there. Everything runs on one thread, and all times are processor times.
 """
 
 from __future__ import annotations
@@ -37,6 +37,9 @@ ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "benchmarks" / "results" / "clip.json"
 PAGE = ROOT / "docs" / "results" / "clip.md"
 SHARED = SPEC.with_name("test_scenes.h5")
+OTHER_CUTOUT = SPEC.with_name("two_holes.toml")
+OTHER_SEED = 1  # other values of the parameters than in the test scenes
+NO_CUTOUT = {"clip.file": ""}  # of which kind a cutout is, where no parameter says it
 STATE = ("PEEQ", REACTION)
 
 
@@ -46,6 +49,7 @@ class Plan:
 
     Attributes:
         nodes, train, valid, test, calibration: of the dataset.
+        other_cutout: the number of clips with a cutout that no training scene has.
         steps, settings: of the training.
         seeds: of the trainings; the run of the first one ships.
     """
@@ -55,6 +59,7 @@ class Plan:
     valid: int = 6
     test: int = 30
     calibration: int = 40
+    other_cutout: int = 6
     steps: int = 3600
     settings: tuple[tuple[str, Any], ...] = (("mirror", ("y",)), ("stress_weight", 0.3))
     seeds: tuple[int, ...] = (0,)
@@ -71,6 +76,17 @@ def trained(plan: Plan, folder: Path, seed: int = 0) -> tuple[ast_sim.Run, Path]
     return run, data
 
 
+def other_cutout(plan: Plan, folder: Path) -> list[tuple[str, ast_sim.Trajectory, float]]:
+    """The clips with a cutout that no training scene has: names, motions, and the seconds of CalculiX."""
+    data = ast_sim.generate(
+        "assembly", folder / "two_holes.h5", spec=OTHER_CUTOUT, nodes=plan.nodes, workers=1, train=0, valid=0,
+        test=plan.other_cutout, seed=OTHER_SEED,
+    ).path  # fmt: skip
+    with ast_sim.Dataset(data) as dataset:
+        seconds = read_seconds(dataset).samples
+        return [(name, truth, sum(seconds[name])) for name, truth in _solved(dataset, "test")]
+
+
 def measured(plan: Plan, folder: Path) -> dict[str, Any]:
     """Solve, train and measure."""
     run, data = trained(plan, folder)
@@ -79,19 +95,27 @@ def measured(plan: Plan, folder: Path) -> dict[str, Any]:
         taken = read_seconds(dataset)
         seconds = {name: sum(frames) for name, frames in taken.samples.items()}
         known, tests, calibration = (_solved(dataset, split) for split in ("train", "test", "calibration"))
-        share_scenes(dataset, [(name, truth) for name, truth in tests if name in clip_variants.SCENES], taken)
-    scenes, unseen = (
-        [{"name": name, "solver_seconds": seconds[name], **_scene_figures(run, truth, others)} for name, truth in group]
-        for group in (tests, calibration)
+        beside = [(name, truth) for name, truth in tests if name in clip_variants.SCENES]
+        share_scenes(dataset, beside, taken)
+    groups = [[(name, truth, seconds[name]) for name, truth in group] for group in (tests, calibration)]
+    scenes, unseen, strangers = (
+        [{"name": name, "solver_seconds": spent, **_scene_figures(run, truth, others)} for name, truth, spent in group]
+        for group in (*groups, other_cutout(plan, folder))
     )
     drawn, outcomes = [values_of(truth.attributes) for _, truth in known], [true_outcome(truth) for _, truth in known]
     for key in Outcome._fields:
         law = gaussian_process(features(drawn, drawn), np.array([getattr(one, key) for one in outcomes]))
-        for group in (scenes, unseen):
-            points = features([scene["parameters"] for scene in group], drawn)
+        for group in (scenes, unseen, strangers):
+            points = features([{**NO_CUTOUT, **scene["parameters"]} for scene in group], drawn)
             for scene, value in zip(group, law(points), strict=True):
                 scene["gaussian_process"] = {**scene.get("gaussian_process", {}), key: float(value)}
-    beside = [scene["parameters"] for scene in scenes if scene["name"] in clip_variants.SCENES]
+    own = [
+        {"nodes": truth.scene.num_nodes, **true_outcome(truth)._asdict(), "seconds": seconds[name], "failures": []}
+        for name, truth in beside
+    ]
+    solved = clip_variants.solved(
+        [values_of(truth.attributes) for _, truth in beside], plan.nodes, folder / "variants.json"
+    )
     return {
         **provenance("python -m benchmarks.studies.clip"),
         "plan": {**plan.__dict__, "settings": dict(plan.settings)},
@@ -103,7 +127,8 @@ def measured(plan: Plan, folder: Path) -> dict[str, Any]:
         "parameters": run.model.num_parameters,
         "scenes": scenes,
         "unseen": unseen,
-        "variants": clip_variants.solved(beside, plan.nodes, folder / "variants.json"),
+        "other_cutout": strangers,
+        "variants": {clip_variants.OWN: own, **solved},
     }
 
 

@@ -21,7 +21,11 @@ ANSWERS = (
     ("Gaussian process", "gaussian_process"),
 )
 
-TABLES = {"scenes": "test scenes", "unseen": "more scenes, by which nothing was chosen"}
+TABLES = {
+    "scenes": "test scenes",
+    "unseen": "more scenes, by which nothing was chosen",
+    "other_cutout": "clips with two holes, a cutout that no training scene has",
+}
 
 _INTRODUCTION = """# A metal clip: permanent set and peak force
 
@@ -34,7 +38,8 @@ CalculiX found on the same mesh, in scenes that no training has seen. The run pr
 the frames after the turn from its own answer for the turn
 ([the load path](../reference/model.md#jumps-and-corrections)). The Gaussian process (scikit-learn, a squared
 exponential with a length for each parameter) maps the drawn parameters to both numbers; it knows nothing else of a
-scene, and can predict nothing else. Times are processor times of one thread ({processor}), beside other work.
+scene, and can predict nothing else. No parameter tells it of two holes side by side; the run sees their mesh. Times are
+processor times of one thread ({processor}), beside other work.
 """
 
 _VARIANTS = """
@@ -160,7 +165,7 @@ def settings(results: dict[str, Any], number: str) -> dict[str, Setting]:
 def _variants(results: dict[str, Any]) -> list[str]:
     """The table of the settings, who is as accurate as the run, and after how many questions each answer pays."""
     off = {number: settings(results, number) for number in Outcome._fields}
-    count = len(off["set"][OWN.name].errors)
+    count = len(off["set"][OWN].errors)
     within = f"{math.ceil(0.9 * count)} of {count} below"
     lines = [
         _VARIANTS.format(count=count, first=clip_variants.SCENES[0], last=clip_variants.SCENES[-1]),
@@ -191,7 +196,7 @@ def _verdicts(results: dict[str, Any], off: dict[str, dict[str, Setting]]) -> li
     run = off["set"][ANSWERS[1][0]]
     simulated = results["simulation_seconds"]
     invested = simulated["train"] + simulated["valid"] + results["training_seconds"]
-    own = off["set"][OWN.name]
+    own = off["set"][OWN]
     lines = [
         f"- Simulation and training took {duration(invested)} of one core. Beside CalculiX on the scene's own mesh, as"
         f" in the dataset, the run pays after {_questions(invested, own, run)}, the Gaussian process, which needs the"

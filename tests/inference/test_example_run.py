@@ -88,9 +88,9 @@ def test_ten_scenes_of_the_repository_have_the_errors_of_the_page():
             assert true == pytest.approx(tuple(known[name]["true"].values()), rel=1e-6)
             answer = run.predict(truth)
             said = outcome(truth.scene, truth.position[0], answer.position[-1], answer.fields[REACTION].values)
-            of_page = np.array(tuple(known[name]["run"].values())) / true - 1
+            of_page = np.array(tuple(known[name]["run_two_frames"].values())) / true - 1
             np.testing.assert_allclose(np.array(said) / true - 1, of_page, atol=1e-3)
-            assert np.all(np.abs(of_page) < (0.03, 0.09))  # set and force
+            assert np.all(np.abs(of_page) < (0.04, 0.09))  # set and force
 
 
 def true_sets(rows):

@@ -132,6 +132,7 @@ def clips(tmp_path_factory) -> Path:
         (r"yield_stress = \[.*?\]", "yield_stress = 3.5e8"),
         (r"file = \[.*?\]", 'file = "clip.py:notches"'),
         (r"travel = \[.*?\]", "travel = [1.0, 2.5]"),
+        (r"finer = .*\n", ""),
         (r"size = .*", "size = 6.0"),
     ):
         text, count = re.subn(pattern, one, text)
