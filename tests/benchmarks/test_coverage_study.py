@@ -16,7 +16,7 @@ FRESH = 3
 @pytest.fixture
 def small(monkeypatch, tmp_path, one_thread):
     """A row of plates whose run had four steps; results in a folder apart."""
-    plates = {"family": "deforming_plate", "nodes": 100, "frames": 4}
+    plates = {"family": "deforming_plate", "nodes": 100, "frames": 3}
 
     def trained(folder):
         data = ast_sim.generate(out=folder / "small.h5", train=30, valid=1, test=1, **plates).path

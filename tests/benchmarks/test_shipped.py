@@ -10,11 +10,11 @@ from benchmarks.studies import coverage, jumps, shipped
 
 def test_a_run_is_simulated_trained_calibrated_and_saved(tmp_path, monkeypatch, capsys):
     row = replace(
-        jumps.ROWS["plates400_long"], data="small", nodes=100, frames=5, keep=None, train=30, valid=1, test=1, steps=4,
+        jumps.ROWS["plates400_long"], data="small", nodes=100, frames=3, keep=None, train=30, valid=1, test=1, steps=4,
         settings={"mirror": ("x", "y"), "corrections": 0, "batch_size": 2, "statistics_pairs": 4},
     )  # fmt: skip
     monkeypatch.setitem(jumps.ROWS, "plates400_long", row)
-    small = {"family": "deforming_plate", "nodes": 100, "frames": 5}
+    small = {"family": "deforming_plate", "nodes": 100, "frames": 3}
     monkeypatch.setitem(coverage.ROWS, "plates", replace(coverage.ROWS["plates"], generate=small, calibration=24))
     monkeypatch.setattr(shipped, "SHIPPED", tmp_path)
     shipped.main(["plates", "--folder", str(tmp_path / "data")])
