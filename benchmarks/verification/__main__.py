@@ -127,6 +127,11 @@ def document(records: dict[str, dict]) -> str:
     failed = [row for row in rows if not row["holds"]]
     made = {(entry["made"]["commit"] or "?")[:10] for entry in records.values()}
     last = list(records.values())[-1]["made"]
+    processors: dict[str, list[str]] = {}
+    for name, entry in records.items():
+        processors.setdefault(entry["made"]["processor"], []).append(f"`{name}`")
+    usual = max(processors, key=lambda one: len(processors[one]))
+    others = "".join(f" ({', '.join(names)}: {one})" for one, names in processors.items() if one != usual)
     seconds = sum(entry["seconds"] for entry in records.values())
     versions = ", ".join(f"{name} {number}" for name, number in last["versions"].items())
     missing = [f"`{name}`" for name in PROBLEMS if name not in records]
@@ -134,7 +139,7 @@ def document(records: dict[str, dict]) -> str:
     lines = [
         INTRODUCTION,
         f"{len(rows) - len(failed)} of {len(rows)} rows hold. Made at commit {', '.join(sorted(made))} on"
-        f" {last['processor']}, one thread; {versions}; {seconds:.0f} s in all.",
+        f" {usual}{others}, one thread; {versions}; {seconds:.0f} s in all.",
         "",
         *unsolved,
     ]

@@ -57,6 +57,9 @@ def test_the_document_shows_a_row_that_fails():
     assert "| a quantity | 1 N | 2 N | 1.0e+00 | 1.0e-01 | **NO** | a reason |" in text
     assert "0 of 1 rows hold" in text and "verification/patch_name.svg" in text and "a remark" in text
     assert "Not solved yet at this state: `derivatives`" in text
+    elsewhere = {**found, "made": {**found["made"], "processor": "q"}}
+    text = verification.document({"patch": found, "strip": found, "cost": elsewhere})
+    assert "at commit cccccccccc on p (`cost`: q), one thread" in text
 
 
 def test_the_document_in_the_tree_follows_from_the_records():
