@@ -6,6 +6,8 @@ from pathlib import Path
 from statistics import median
 
 from benchmarks.studies import clip_page, example_meshes
+from benchmarks.studies.clip_outcome import Outcome, errors
+from benchmarks.studies.clip_variants import FINER
 
 ROOT = Path(__file__).parents[2]
 README, EFFORTS, SCENES, OWN_DATA = (
@@ -75,6 +77,37 @@ def test_both_sides_of_the_clip_pay_beside_the_same_solver():
     page = clip_page.page(results("clip"))
     counts = numbers(r"in the dataset, the run pays after (\d+) questions, the Gaussian process, .*?after (\d+)", page)
     assert numbers(r"after (\d+) predictions, the Gaussian process its simulations after (\d+)", README) == counts
+
+
+def test_errors_and_times_of_the_clip():
+    """As the page has them, which is made from the same results."""
+    found = results("clip")
+    page = clip_page.page(found)
+    tables = re.findall(r"^\| the run, all frames \|(.*)$", page, re.MULTILINE)[:3]
+    shown = re.findall(
+        r"^\| \d+ ?(?:,|by|with).*? \| ([\d.]+ ± [\d.]+ %) \| ([\d.]+ ± [\d.]+ %) \|$", README, re.MULTILINE
+    )
+    assert shown == [(cells[0].strip(), cells[3].strip()) for cells in (row.split("|") for row in tables)]
+    process = numbers(
+        r"Its errors are ([\d.]+) % \(permanent set\) and ([\d.]+) % \(force\) on the 30 clips, ([\d.]+) % and"
+        r" ([\d.]+) % on the 40: .*? there its errors are ([\d.]+) and ([\d.]+) %",
+        README,
+    )
+    medians = [
+        100 * median(errors(found[key], "gaussian_process", number))
+        for key in clip_page.TABLES
+        for number in Outcome._fields
+    ]
+    assert process == tuple(round(value, 1) for value in medians)
+    told = numbers(r"frames 3 and 6 takes (\d+) ms, CalculiX ([\d.]+) s a scene: (\d+) ± (\d+) times", page)
+    ours = numbers(r"CalculiX takes (\d+) s a scene .*? The run takes (\d+) ms .*? takes (\d+) ± (\d+) times", README)
+    assert ours == (int(told[1]), told[0], *told[2:])
+    off = [
+        abs(scene["true"]["peak"] / one["peak"] - 1)
+        for scene, one in zip(found["scenes"][16:19], found["variants"][FINER.name], strict=True)
+    ]
+    mesh = numbers(r"their peak force ([\d.]+), ([\d.]+) and ([\d.]+) % wrong", README)
+    assert mesh == tuple(sorted(round(100 * value, 1) for value in off))
 
 
 def test_the_meshes_of_the_examples():
