@@ -63,6 +63,12 @@ def hints(columns: Iterable[str]) -> list[str]:
     return told
 
 
+def listed_columns(attributes: Mapping[str, Any]) -> list[str]:
+    """The names of the columns of the material, as the attributes of a trajectory from other programs list them."""
+    listed = str(attributes.get("material", ""))
+    return listed.split(", ") if listed else []
+
+
 @dataclass(frozen=True)
 class Material:
     """The material of all scenes of a dataset, or of one scene.

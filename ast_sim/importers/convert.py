@@ -21,6 +21,7 @@ from ast_sim.importers.order_of_files.frame_files import files_of_frames
 from ast_sim.importers.order_of_files.left_out import left_out
 from ast_sim.importers.order_of_files.listed import SERIES
 from ast_sim.importers.series import FieldNames, read_series
+from ast_sim.material import listed_columns
 from ast_sim.plausibility.across import AcrossSimulations
 from ast_sim.plausibility.findings import Finding, refusal, told, wrong
 from ast_sim.scene import Trajectory
@@ -186,9 +187,9 @@ def _require_even_times(source: Path, trajectory: Trajectory) -> None:
 
 def _facts_of_the_first(trajectory: Trajectory) -> dict[str, Any]:
     """The origin of all simulations, and the names of the columns of their material."""
-    columns = str(trajectory.attributes.get("material", ""))
+    columns = listed_columns(trajectory.attributes)
     origin = trajectory.attributes.get("origin", [0.0, 0.0, 0.0])
-    return {"origin": origin, **({"material": columns.split(", ")} if columns else {})}
+    return {"origin": origin, **({"material": columns} if columns else {})}
 
 
 def _line(split: str, name: str, trajectory: Trajectory) -> str:

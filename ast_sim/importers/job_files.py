@@ -11,7 +11,7 @@ import numpy as np
 from ast_sim.dataset.layout import LENGTH_UNITS
 from ast_sim.importers.series import FieldNames
 from ast_sim.importers.stress import STRESS_UNITS
-from ast_sim.material import YOUNG
+from ast_sim.material import YOUNG, listed_columns
 from ast_sim.scene import Trajectory
 from ast_sim.support.errors import ConfigError, DatasetError, warn
 
@@ -58,7 +58,7 @@ def with_units(decks: Mapping[str, Path], names: FieldNames, length_unit: str | 
 
 def doubt_modulus(deck: Path, trajectory: Trajectory, unit: str) -> None:
     """Warn if Young's modulus is one that no common material has, or about 1: then another unit may be meant."""
-    columns = str(trajectory.attributes.get("material")).split(", ")
+    columns = listed_columns(trajectory.attributes)
     if trajectory.scene.material is None or YOUNG not in columns:
         return
     moduli = np.unique(trajectory.scene.material[trajectory.scene.deforming("element"), columns.index(YOUNG)])

@@ -13,7 +13,7 @@ import math
 import numpy as np
 
 from ast_sim.element_topology import signed_volumes
-from ast_sim.material import POISSON
+from ast_sim.material import POISSON, listed_columns
 from ast_sim.number_arrays import point
 from ast_sim.plausibility.body_places import change_places
 from ast_sim.plausibility.findings import Finding, places
@@ -69,7 +69,7 @@ def in_trajectory(trajectory: Trajectory, dynamic: bool = False) -> list[Finding
 
 def _poisson(trajectory: Trajectory) -> list[Finding]:
     scene = trajectory.scene
-    columns = str(trajectory.attributes.get("material", "")).split(", ")
+    columns = listed_columns(trajectory.attributes)
     if scene.material is None or POISSON not in columns:
         return []
     ratio = scene.material[:, columns.index(POISSON)]

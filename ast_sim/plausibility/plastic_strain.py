@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ast_sim.material import ELASTIC, YIELD_STRESS
+from ast_sim.material import ELASTIC, YIELD_STRESS, listed_columns
 from ast_sim.named_field import PLASTIC_STRAIN
 from ast_sim.plausibility.findings import Finding, places
 from ast_sim.scene import Trajectory
@@ -14,7 +14,7 @@ def plastic_but_elastic(trajectory: Trajectory) -> list[Finding]:
     """Elements with an equivalent plastic strain in some frame and a known elastic law, without a yield stress. At
     nodes, all nodes of the element must have one, since results are averaged where two materials meet."""
     scene = trajectory.scene
-    columns = str(trajectory.attributes.get("material", "")).split(", ")
+    columns = listed_columns(trajectory.attributes)
     field = trajectory.fields.get(PLASTIC_STRAIN)
     if scene.material is None or field is None or not set(columns).issuperset(ELASTIC):
         return []

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ast_sim.material import POISSON, YIELD_STRESS, YOUNG
+from ast_sim.material import POISSON, YIELD_STRESS, YOUNG, listed_columns
 from ast_sim.plausibility.findings import Finding, places
 from ast_sim.scene import Trajectory
 
@@ -68,7 +68,7 @@ def stiffness(trajectory: Trajectory) -> Stiffness | None:
     """None if there is no stress, too little strain, or a material whose modulus is not named."""
     scene = trajectory.scene
     stress = trajectory.stress
-    columns = _columns(trajectory)
+    columns = listed_columns(trajectory.attributes)
     flat = scene.elements.shape[1] == 3 and bool(np.ptp(trajectory.position[..., 2]) == 0)
     if stress is None or (scene.material is not None and YOUNG not in columns):
         return None
@@ -141,7 +141,7 @@ class Moduli(NamedTuple):
 def moduli(trajectory: Trajectory) -> Moduli:
     """The moduli of the elements that deform; none if no column says them, or if they are too many for materials."""
     material = trajectory.scene.material
-    columns = _columns(trajectory)
+    columns = listed_columns(trajectory.attributes)
     if material is None or YOUNG not in columns or POISSON not in columns:
         return Moduli(())
     rows = material[trajectory.scene.deforming_elements][:, [columns.index(YOUNG), columns.index(POISSON)]]
@@ -168,7 +168,7 @@ def other_moduli(known: Sequence[tuple[str, Moduli]]) -> list[tuple[str, Finding
 def yielding(trajectory: Trajectory) -> list[Finding]:
     """Elements whose yield stress cannot be one beside their Young's modulus."""
     material = trajectory.scene.material
-    columns = _columns(trajectory)
+    columns = listed_columns(trajectory.attributes)
     if material is None or YOUNG not in columns or YIELD_STRESS not in columns:
         return []
     young, limit = (material[:, columns.index(name)].astype(np.float64) for name in (YOUNG, YIELD_STRESS))
@@ -179,10 +179,6 @@ def yielding(trajectory: Trajectory) -> list[Finding]:
         return []
     meaning = f"it is {share[rows[0]]:.3g} of Young's modulus: are both in one unit?"
     return [Finding("elements whose yield stress cannot be one", len(rows), places("elements", rows), meaning)]
-
-
-def _columns(trajectory: Trajectory) -> list[str]:
-    return str(trajectory.attributes.get("material", "")).split(", ")
 
 
 def _spread_over(rows: np.ndarray, most: int) -> np.ndarray:

@@ -1,4 +1,7 @@
-"""The clip of `clip.py` with two round holes side by side in its arm, which no scene of `SPEC.toml` has."""
+"""The clip of `clip.py` with two round holes side by side in its arm, which no scene of `SPEC.toml` has.
+
+A script of its own: runs know `clip.py` by its contents, and tell a question in which it has changed.
+"""
 
 import runpy
 from pathlib import Path
