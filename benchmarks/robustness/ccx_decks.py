@@ -30,7 +30,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ast_sim.importers.mesh_file import MeshFile, read_mesh
-from ast_sim.simulate.calculix.solve import find_ccx
+from ast_sim.simulate.calculix.program import find_ccx
 from ast_sim.support.disk import write_json
 from ast_sim.support.errors import AstSimError
 from ast_sim.support.provenance import provenance

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ast_sim.simulate.calculix.solve import find_ccx
+from ast_sim.simulate.calculix.program import find_ccx
 
 # Corners of a hexahedron, then the ends of the edges whose middles follow, in the order of C3D20R.
 _CORNERS = ((0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1))

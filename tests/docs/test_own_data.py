@@ -14,7 +14,7 @@ from vtk_series import read
 from ast_sim.cli import main
 from ast_sim.dataset.reader import Dataset
 from ast_sim.scene import NodeType
-from ast_sim.simulate.calculix.solve import find_ccx
+from ast_sim.simulate.calculix.program import find_ccx
 
 PAGE = blocks((Path(__file__).parents[2] / "docs" / "how-to" / "own-data.md").read_text(encoding="utf-8"))
 SHORT = ["train.steps=4", "train.batch_size=2", "train.statistics_pairs=4", "model.hidden=16", "model.d_token=16"]

@@ -1,20 +1,14 @@
 """CalculiX (`ccx`) as a second solver of quasi-static cases: an independent check of the bundled solver.
 
 Mesh, material (CIARLET_EL) and motion of the prescribed nodes are the same; bodies that yield (*PLASTIC) are solved by
-CalculiX only. Contact differs: CalculiX uses a
-face-to-face penalty, so surfaces penetrate a little. The barrier of the bundled solver leaves a little air instead.
-CalculiX is licensed under the GPL and runs as a program of its own. Debian and Ubuntu have it as `calculix-ccx`. The
-environment variable CCX_BIN names another binary.
+CalculiX only. Contact differs: CalculiX uses a face-to-face penalty, so surfaces penetrate a little. The barrier of the
+bundled solver leaves a little air instead.
 """
 
 from __future__ import annotations
 
-import os
-import re
 import resource
 import shutil
-import signal
-import subprocess
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -30,12 +24,10 @@ from ast_sim.named_field import PLASTIC_STRAIN, REACTION, NamedField
 from ast_sim.scene import AttributeValue, Trajectory
 from ast_sim.simulate.calculix.ccx_results import Results, read_results
 from ast_sim.simulate.calculix.deck import Increments, contact_stiffness, write_deck
-from ast_sim.support.errors import MissingExtra, SimulationError
+from ast_sim.simulate.calculix.program import JOB, Ended, find_ccx, run, version
+from ast_sim.support.errors import SimulationError
 
-JOB = "case"
 POINTS = {4: 1, 10: 4}  # of integration, by the number of nodes of an element
-BEST_GUESS = "best solution and residuals are in the frd file"
-FAILED = 201  # what ccx returns when it gives up, for whatever reason
 # These are tried one after another until all frames converge: first softer contact, then shorter increments, too.
 LADDER = (Increments(), Increments(stiffness=0.1), Increments(stiffness=0.1, largest=0.5))
 # Those where bodies yield: shorter increments follow the load path.
@@ -54,36 +46,6 @@ class CalculixSettings:
 
     ladder: tuple[Increments, ...] | None = None
     timeout: float = 7200.0
-
-
-def find_ccx() -> str:
-    """Path of the binary: CCX_BIN if set, else `ccx` in PATH.
-
-    Raises:
-        MissingExtra: there is no such program.
-    """
-    wanted = os.environ.get("CCX_BIN")
-    program = shutil.which(wanted or "ccx")
-    if program is None:
-        where = f"CCX_BIN={wanted} is no program" if wanted else "ccx is not in PATH and CCX_BIN is not set"
-        raise MissingExtra(f"CalculiX is needed here but {where}: apt install calculix-ccx")
-    return os.path.abspath(program)  # ccx runs in another folder
-
-
-def version(ccx: str) -> str:
-    """Version that the binary reports, such as "2.20".
-
-    Raises:
-        SimulationError: the binary does not run, or reports no version.
-    """
-    try:
-        answer = subprocess.run([ccx, "-v"], capture_output=True, text=True, timeout=60, stdin=subprocess.DEVNULL)
-    except (OSError, subprocess.TimeoutExpired) as error:
-        raise SimulationError(f"{ccx} does not run: {error}") from error
-    match = re.search(r"[Vv]ersion (\d[\w.]*)", answer.stdout)
-    if not match:
-        raise SimulationError(f"{ccx} -v reports no version; is it CalculiX? {_last_line(answer.stdout)}")
-    return match[1]
 
 
 def quasi_static(case: SolidCase, settings: CalculixSettings | None = None) -> Trajectory:
@@ -145,8 +107,8 @@ def _attempt(case: SolidCase, ccx: str, increments: Increments, timeout: float) 
         before = _processor_seconds()
         results = None
         try:
-            stopped_by = _run(ccx, folder, timeout)
-        except _Ended as error:
+            stopped_by = run(ccx, folder, timeout)
+        except Ended as error:
             stopped_by = str(error)
             results = Results.none(case.scene.num_nodes, case.scene.num_elements, bool(case.hardening))
         seconds = _processor_seconds() - before
@@ -160,10 +122,6 @@ def _attempt(case: SolidCase, ccx: str, increments: Increments, timeout: float) 
     return trajectory
 
 
-class _Ended(SimulationError):
-    """A run crashed or took too long, which other increments may mend. What it wrote may be cut off."""
-
-
 def _processor_seconds() -> float:
     """Processor time of all programs that this process has started and that have ended."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -175,40 +133,6 @@ def _results(case: SolidCase, folder: Path) -> Results:
     points = POINTS[scene.elements.shape[1]]
     size = len(case.prescribed_position) - 1, scene.num_nodes, scene.num_elements, points
     return read_results(folder, JOB, *size, yields=bool(case.hardening))
-
-
-def _run(ccx: str, folder: Path, timeout: float) -> str:
-    """Run the deck in the folder; return why it ended early, or "".
-
-    Raises:
-        _Ended: ccx did not end in time, or crashed.
-        SimulationError: ccx failed for another reason than missing convergence.
-    """
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "CCX_NPROC_EQUATION_SOLVER": "1", "CCX_NPROC_RESULTS": "1"}
-    log = folder / f"{JOB}.log"
-    with open(log, "w") as output:
-        try:
-            code = subprocess.run(
-                [ccx, "-i", JOB],
-                cwd=folder,
-                env=environment,
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=subprocess.STDOUT,
-                timeout=timeout,
-            ).returncode
-        except subprocess.TimeoutExpired:
-            raise _Ended(f"ccx did not end within {timeout:g} s") from None
-        except OSError as error:
-            raise SimulationError(f"{ccx} does not run: {error}") from error
-    if code == 0:
-        return ""
-    if code < 0:
-        raise _Ended(f"ccx was killed by {signal.Signals(-code).name}")
-    reason = _error(_read(log))
-    if code == FAILED and re.match(r"too many|increment size smaller", reason):
-        return f"no convergence in CalculiX: {reason}"
-    raise SimulationError(f"ccx ended with code {code}: {reason}")
 
 
 def _trajectory(
@@ -314,17 +238,3 @@ def _von_mises(stress: np.ndarray) -> np.ndarray:
     """[S,E] of the stress [S,E,6]."""
     tensor = stress.reshape(-1, 6)[:, [[0, 3, 5], [3, 1, 4], [5, 4, 2]]]
     return von_mises(np.moveaxis(tensor, 0, -1)).reshape(stress.shape[:2])
-
-
-def _read(path: Path) -> str:
-    return path.read_text(encoding="utf-8", errors="replace")
-
-
-def _error(log: str) -> str:
-    """The last message that ccx marks as an error, on one line; else its last words."""
-    errors = re.findall(r"\*ERROR:? *(.*(?:\n(?! *\n| *\*).*)*)", log)
-    return " ".join(errors[-1].split()).removesuffix(" " + BEST_GUESS) if errors else _last_line(log)
-
-
-def _last_line(text: str) -> str:
-    return (text.strip().splitlines() or ["it printed nothing"])[-1].strip()

@@ -213,7 +213,7 @@ def _versions(recipe: Recipe) -> dict[str, str | None]:
         except importlib.metadata.PackageNotFoundError:
             versions[name] = None
     if recipe.solver == "calculix":
-        from ast_sim.simulate.calculix.solve import find_ccx, version
+        from ast_sim.simulate.calculix.program import find_ccx, version
 
         versions["calculix"] = version(find_ccx())
     return versions

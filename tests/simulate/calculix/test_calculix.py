@@ -13,6 +13,7 @@ from ast_sim.mechanics.case import SolidCase
 from ast_sim.mechanics.contact_and_friction import ContactSettings
 from ast_sim.mechanics.elements.neo_hookean import NeoHookean
 from ast_sim.scene import NodeType, Scene, Trajectory
+from ast_sim.simulate.calculix import program
 from ast_sim.simulate.calculix import solve as calculix
 from ast_sim.simulate.calculix.ccx_results import read_increments, read_results
 from ast_sim.simulate.calculix.deck import Increments, contact_stiffness, slave_first, write_deck
@@ -262,7 +263,7 @@ def output(tmp_path_factory) -> tuple[Path, SolidCase]:
     folder, case = tmp_path_factory.mktemp("ccx"), uniaxial(np.array([1, 1.1, 1.2]))
     with open(folder / "case.inp", "w") as file:
         write_deck(file, case, Increments())
-    assert calculix._run(calculix.find_ccx(), folder, 60) == ""
+    assert program.run(program.find_ccx(), folder, 60) == ""
     return folder, case
 
 
@@ -367,6 +368,31 @@ def test_a_run_that_crashes_or_takes_too_long_leaves_the_frame_at_rest(tmp_path,
     solved = calculix.quasi_static(case, CalculixSettings(timeout=0.2))
     assert solved.attributes["status"] == "truncated" and solved.attributes["stopped_by"] == f"frame 1: ccx {why}"
     np.testing.assert_array_equal(solved.position, [case.scene.rest_position])
+    assert [path.name for path in tmp_path.iterdir()] == ["ccx"]
+
+
+HEADING = "summary\\nstep\\ncontact\\npercent\\n"
+
+
+@pytest.mark.parametrize(
+    ("script", "ended"),
+    [
+        (f"printf '{HEADING}1\\n' > case.cvg; exec sleep 10", "hangs: no iteration has ended for "),
+        (f"printf '{HEADING}' > case.cvg; exec sleep 10", "did not end within 3 s"),  # of the first one
+        (f"printf '{HEADING}1\\n' > case.cvg; for i in $(seq 99); do sleep 0.1; echo $i >> case.cvg; done", "did not"),
+        (f"printf '{HEADING}' > case.cvg; sleep 0.9; echo 1 >> case.cvg; exec sleep 10", "did not"),  # as before
+    ],
+)
+def test_a_search_for_contact_that_never_ends_is_given_up(tmp_path, monkeypatch, script, ended):
+    """Else each attempt takes the two hours of the timeout."""
+    monkeypatch.setattr(program, "SECONDS_BETWEEN_LOOKS", 0.05)
+    monkeypatch.setattr(program, "SECONDS_OF_SILENCE", 1.0)
+    monkeypatch.setattr(program, "LONGEST", 4)
+    fake_ccx(tmp_path, monkeypatch, script)
+    settings = CalculixSettings(ladder=(Increments(),), timeout=3)
+    solved = calculix.quasi_static(uniaxial(np.array([1, 1.1])), settings)
+    assert solved.attributes["status"] == "truncated"
+    assert solved.attributes["stopped_by"].startswith(f"frame 1: ccx {ended}")
     assert [path.name for path in tmp_path.iterdir()] == ["ccx"]
 
 
