@@ -8,6 +8,7 @@ from exodus_made import ELEMENTS, LOW, PAD_NODES, POINTS, SIDES, TOOL_NODES, UNW
 from ast_sim.importers.convert import convert
 from ast_sim.importers.formats.exodus.exodus_files import exodus_facts
 from ast_sim.importers.formats.exodus.netcdf_head import read_netcdf_head
+from ast_sim.importers.formats.vtk_files import _checked
 from ast_sim.importers.mesh_file import read_mesh
 from ast_sim.importers.series import FieldNames, read_series
 from ast_sim.scene import NodeType
@@ -245,6 +246,17 @@ def test_a_mesh_by_its_name_may_hold_results(tmp_path):
     assert counts["train"] == 1
     with pytest.raises(DatasetError, match="mesh.g: must be a .pvd"):
         read_series(tmp_path / "mesh.g", NAMES)
+
+
+def test_the_memory_for_a_packed_file_follows_its_arrays_not_its_length(tmp_path):
+    """Else a long series that packs well would be refused: VTK needs memory for what it unpacks."""
+    path = tmp_path / "packed.e"
+    exodus().write_hdf(path)
+    before = _checked(path).budget
+    with h5py.File(path, "r+") as file:
+        file.create_dataset("packed", data=np.zeros((100, 20_000)), chunks=(1, 20_000), compression="gzip")
+    assert path.stat().st_size < 1_000_000
+    assert _checked(path).budget - before == 8 * 100 * 20_000 * 8  # bytes, for eight copies
 
 
 def write_pieces(folder, parts, numbers=PAD_NODES, times=(0.0, 0.5, 1.0)):
