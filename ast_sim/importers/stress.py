@@ -266,7 +266,7 @@ class Symmetry:
     def look(self, path: Path, values: np.ndarray, order: tuple[str, ...]) -> None:
         """Take the stress of a frame, [rows, columns]."""
         columns = dict(zip(order, values.T, strict=False))
-        self.largest = np.nanmax(np.abs(values), initial=self.largest) if order else self.largest
+        self.largest = float(np.nanmax(np.abs(values), initial=self.largest)) if order else self.largest
         for pair in _PAIRS:
             if {pair, pair[::-1]} <= columns.keys():
                 with np.errstate(invalid="ignore"):  # infinite values are told elsewhere
