@@ -32,12 +32,15 @@ def require_complete(source: Path, trajectory: Trajectory, names: FieldNames, de
     """
     missing = _missing(trajectory)
     if missing:
-        unused = _unused(next(iter(frames(source))), names) if deck is None else []
+        first = next(iter(frames(source))) if deck is None else None
+        unused = _unused(first, names) if first is not None else []
         named = ", ".join(f"{name} ({option})" for option, name in unused)
         options = " ".join(f"{option} {name}" for option, name in unused if "|" not in option)
         arguments = ", ".join(f"{option[2:]}={name!r}" for option, name in unused if "|" not in option)
         advice = f"; these fields were not used: {named}" if unused else ""
         advice += f"; try {options}, in Python names=FieldNames({arguments})" if options else ""
+        if first is not None and "displacement" in first.cell_fields.keys() - first.point_fields.keys():
+            advice += "; 'displacement' is a cell field, and must be one of points"
         raise DatasetError(
             f"{source}: {' and '.join(missing)}{advice}; to predict a mesh with a trained run, use `ast-sim predict RUN"
             " MESH --move BODY=X,Y,Z`; to convert as it is, give incomplete=True (--incomplete)"

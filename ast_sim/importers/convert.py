@@ -127,7 +127,9 @@ def convert_series(
 
 
 def _agree(writer: FittedWriter, made_by: dict[str, Any], path: Path, trajectory: Trajectory) -> None:
-    """The first simulation says where a stress lives; raise DatasetError if another one says otherwise."""
+    """The first simulation says where a stress lives; raise DatasetError if another one says otherwise. Warn of times
+    that are not the time step's."""
+    _doubt_time_step(path, trajectory, writer.info.time_step)
     if not any(writer.counts.values()):
         made_by |= _facts_of_the_first(trajectory)
         writer.info = replace(writer.info, stress_location=trajectory.stress_at)
@@ -182,6 +184,17 @@ def _require_even_times(source: Path, trajectory: Trajectory) -> None:
         raise DatasetError(
             f"{source}: from frame {first} to {first + 1} {steps[first]:.4g} s pass, from most frames to the next"
             f" {np.median(steps):.4g} s: with inertia all time steps must be equal"
+        )
+
+
+def _doubt_time_step(source: Path, trajectory: Trajectory, time_step: float) -> None:
+    """Warn if the times in the files say another step from frame to frame; counts of frames, 0, 1, 2, say none."""
+    steps = np.diff(trajectory.times or ())
+    usual = float(np.median(steps)) if len(steps) else 0.0
+    if time_step and len(steps) and abs(usual - time_step) > EVEN * time_step and (steps != 1).any():
+        warn(
+            f"{source}: by its files {usual:.4g} s pass from frame to frame, and time_step (--time-step) says"
+            f" {time_step:.4g}: frames keep the times of the files; is another unit meant?"
         )
 
 

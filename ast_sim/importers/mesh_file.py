@@ -213,7 +213,10 @@ def raw_field(mesh: SourceMesh, place: str, name: str) -> np.ndarray:
     fields = mesh.point_fields if place == "point" else mesh.cell_fields
     if name not in fields:
         known = ", ".join(sorted(fields)) or "none"
-        raise DatasetError(f"{mesh.path}: there is no {place} field {name!r}; there are: {known}")
+        other = "cell" if place == "point" else "point"
+        elsewhere = name in (mesh.cell_fields if other == "cell" else mesh.point_fields)
+        told = f": {name!r} is a {other} field" if elsewhere else ""
+        raise DatasetError(f"{mesh.path}: there is no {place} field {name!r}{told}; there are: {known}")
     values = mesh.point_fields[name] if place == "point" else np.concatenate(mesh.cell_fields[name])
     if values.dtype.kind not in "iufb":
         raise DatasetError(f"{mesh.path}: the {place} field {name!r} does not hold numbers")

@@ -13,7 +13,7 @@ from typing import Any
 
 import h5py
 
-from ast_sim.importers.decks.nastran_cards import plain_nastran
+from ast_sim.importers.decks.nastran_cards import left_out_of_nastran, plain_nastran
 from ast_sim.importers.formats.source_mesh import INSTEAD, SourceMesh, from_meshio
 from ast_sim.importers.formats.text_surfaces import plain_obj, plain_off, plain_ply, require_header_of_ply
 from ast_sim.support.errors import DatasetError
@@ -48,7 +48,8 @@ def by_meshio(path: Path, copy: Path | None = None) -> SourceMesh:
     except (Exception, SystemExit) as error:
         told = what_meshio_says(error, printed.getvalue()).replace(str(file), str(path))
         raise DatasetError(f"{path}: cannot be read as a mesh: {told}; if it is whole, {INSTEAD}") from error
-    return replace(from_meshio(mesh, path), other_way=ending == ".med")
+    notes = left_out_of_nastran(path) if ending in _NASTRAN else []
+    return replace(from_meshio(mesh, path), notes=notes, other_way=ending == ".med")
 
 
 @contextlib.contextmanager

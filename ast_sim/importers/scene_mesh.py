@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,7 +20,7 @@ from ast_sim.number_arrays import nodes_of_body, real_numbers, rounding
 from ast_sim.plausibility.topology import at_rest
 from ast_sim.scene import NodeType, Scene
 from ast_sim.support.argument_checks import file_name, in_short, require_bool, require_type, several
-from ast_sim.support.errors import ConfigError, counted
+from ast_sim.support.errors import ConfigError, DatasetError, counted
 
 if TYPE_CHECKING:
     import meshio
@@ -203,6 +204,30 @@ def clamped(mesh: MeshFile, scene: Scene, used: np.ndarray, clamp: str) -> np.nd
             )
         held |= inside
     return nodes[held]
+
+
+def marked_nodes(mesh: MeshFile, scene: Scene, used: np.ndarray, name: str) -> np.ndarray:
+    """The nodes of the scene of a mesh that a point field, a group or a place BODY:PLACE marks, as a mask or as
+    numbers; `used` as in `clamped`. A note tells if a field and a group have the name.
+
+    Raises:
+        DatasetError, ConfigError: there is none of this name; see `clamped`.
+    """
+    if name in mesh.source.point_fields:
+        marks = mesh.marks(name)[used]
+        if name in mesh.groups and not np.array_equal(marks, np.isin(used, mesh.groups[name])):
+            mesh.notes.append(f"{name!r} is a field of points and a group of other nodes: the field is taken")
+        return marks
+    if name in mesh.groups:
+        return np.isin(used, mesh.groups[name])
+    if re.match(r"\s*[0-9]+\s*:", name):
+        return clamped(mesh, scene, used, name)
+    fields = ", ".join(sorted(mesh.source.point_fields)) or "none"
+    groups = ", ".join(sorted(mesh.groups)) or "none"
+    raise DatasetError(
+        f"{mesh.path}: there is no point field {name!r}; there are: {fields}; groups of nodes: {groups}; places are"
+        " written BODY:PLACE, for example 0:zmin"
+    )
 
 
 def _on_a_line(points: np.ndarray) -> bool:

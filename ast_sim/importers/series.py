@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,12 +17,14 @@ from ast_sim.importers.mesh_file import MeshFile, mesh_of, raw_field
 from ast_sim.importers.order_of_files.by_name import ordered
 from ast_sim.importers.order_of_files.doubts import doubts_of_times
 from ast_sim.importers.order_of_files.frame_files import frame_files
-from ast_sim.importers.scene_mesh import clamped
+from ast_sim.importers.scene_mesh import marked_nodes
 from ast_sim.importers.solids.constant_fields import ConstantFields
 from ast_sim.importers.solids.frames_match import in_order_of, order_of_cells
 from ast_sim.importers.solids.kept_fields import KeptFields
 from ast_sim.importers.solids.kept_frames import KeptFrames
+from ast_sim.importers.solids.moved_points import UnnamedDisplacements
 from ast_sim.importers.solids.positions import (
+    displacement_of,
     far_origin,
     fields_of_vector,
     rest_and_position,
@@ -34,7 +35,7 @@ from ast_sim.importers.solids.positions import (
 from ast_sim.importers.solids.stitching import Stitching
 from ast_sim.importers.solved_jobs.job import Job, read_job
 from ast_sim.importers.solved_jobs.job_results import job_frames
-from ast_sim.importers.stress import STRESS_UNITS, of_components, order_of, stress_place, von_mises
+from ast_sim.importers.stress import STRESS_UNITS, Symmetry, of_components, order_of, stress_place, von_mises
 from ast_sim.material import PRESSURES
 from ast_sim.mesh_rules import require_extent
 from ast_sim.plausibility.axes import MIRRORED
@@ -182,6 +183,8 @@ def _read_frames(
     constant = ConstantFields((*used_fields, *names.material_fields))
     place = "none"
     order = ()
+    symmetry = Symmetry()
+    unnamed = UnnamedDisplacements()
     notes = []
     given = frames(source) if job is None else job_frames(job, source, _pascals(names), tuple(further.wanted.values()))
     for frame in given:
@@ -200,9 +203,10 @@ def _read_frames(
             )
         stitching.look(frame, used_fields, fields_of_vector(names.displacement, frame.point_fields))
         constant.look(frame, cells)
+        unnamed.look(frame)
         kept.times.append(frame.time)
         kept.points.append(frame.points)
-        kept.displacements.append(_displacement(frame, names))
+        kept.displacements.append(displacement_of(frame, names.displacement, raw_field))
         further.look(frame, cells, raw_field)
         if place != "none":
             name = names.stress or "von_mises"
@@ -211,6 +215,7 @@ def _read_frames(
             if now != order:
                 one, other = (", ".join(parts) or "one number" for parts in (now, order))
                 raise DatasetError(f"{frame.path}: {name!r} holds {one}, in the first frame {other}: write it alike")
+            symmetry.look(frame.path, values, order)
             values = von_mises(values, order) if order else values[:, 0]
             kept.stresses.append(values if place == "node" or cells is None else values[cells])
         elif "von_mises" in {*frame.point_fields, *frame.cell_fields}:
@@ -218,8 +223,11 @@ def _read_frames(
                 f"{frame.path}: holds 'von_mises', which the first frame lacks: write it into each frame, or into none"
             )
     assert first is not None and stitching is not None
+    symmetry.require(source, names.stress or "von_mises")
     notes += [*constant.notes(), *told_of_components(names.displacement, first.point_fields)]
     notes += _put_in_order_of_time(source, kept, further)
+    if kept.displacements[0] is None:
+        unnamed.require_at_rest(source, kept.points)
     return mesh_of(first, stitching, corners), kept, notes, place
 
 
@@ -252,20 +260,6 @@ def frames(source: Path) -> Iterator[SourceMesh]:
             yield only_frame(files[0])
         else:
             yield from frames_in(files[0])
-
-
-def _displacement(frame: SourceMesh, names: FieldNames) -> np.ndarray | None:
-    """The displacements of the points [n, 3]; None if the file holds none."""
-    fields = fields_of_vector(names.displacement, frame.point_fields)
-    if not fields:
-        return None
-    value = np.concatenate([raw_field(frame, "point", one) for one in fields], axis=1)
-    if value.shape[1] not in (2, 3):
-        held = counted(value.shape[1], "component")
-        raise DatasetError(f"{frame.path}: the displacement has {held}; must have 2 or 3")
-    if value.shape[1] == 2 and any(block.dimension == 3 for block in frame.blocks):
-        raise DatasetError(f"{frame.path}: the displacement of a body with a volume has 2 components; must have 3")
-    return np.pad(value, ((0, 0), (0, 3 - value.shape[1])))
 
 
 def _pascals(names: FieldNames) -> float:
@@ -321,26 +315,25 @@ def _rest_and_position(
 
 
 def _node_type(mesh: MeshFile, names: FieldNames, scene: Scene, used: np.ndarray) -> np.ndarray:
-    """The types of the used nodes, replaced where nodes are marked as handles and obstacles."""
+    """The types of the used nodes, replaced where nodes are marked as handles and obstacles; notes on marks that say
+    nothing, or two things."""
     types = scene.node_type.copy()
-    for name, kind in ((names.handle, NodeType.HANDLE), (names.obstacle, NodeType.OBSTACLE)):
+    handles, obstacles = np.zeros((2, len(used)), bool)
+    for name, marks, kind in (
+        (names.handle, handles, NodeType.HANDLE),
+        (names.obstacle, obstacles, NodeType.OBSTACLE),
+    ):
         if name is not None:
-            types[_marked(mesh, name, scene, used)] = kind
+            marks[marked_nodes(mesh, scene, used, name)] = True
+            types[marks] = kind
+            mesh.notes.extend([] if marks.any() else [f"{name!r} marks no node"])
+    both = (handles & obstacles).sum()
+    if both:
+        told = counted(both, f"node of {names.handle!r} is", f"nodes of {names.handle!r} are")
+        mesh.notes.append(f"{told} in {names.obstacle!r}, too: obstacles, not handles")
+    soft = obstacles & np.isin(scene.body, scene.body[types == NodeType.NORMAL])
+    if soft.any():
+        told = counted(soft.sum(), f"node of {names.obstacle!r} belongs", f"nodes of {names.obstacle!r} belong")
+        mesh.notes.append(f"{told} to a body that deforms, and an obstacle is a rigid body: is a handle meant?")
     types[mesh.shell_nodes[used]] = NodeType.OBSTACLE
     return types
-
-
-def _marked(mesh: MeshFile, name: str, scene: Scene, used: np.ndarray) -> np.ndarray:
-    """The used nodes that a point field, a group or a place BODY:PLACE marks, as a mask or as numbers."""
-    if name in mesh.source.point_fields:
-        return mesh.marks(name)[used]
-    if name in mesh.groups:
-        return np.isin(used, mesh.groups[name])
-    if re.match(r"\s*[0-9]+\s*:", name):
-        return clamped(mesh, scene, used, name)
-    fields = ", ".join(sorted(mesh.source.point_fields)) or "none"
-    groups = ", ".join(sorted(mesh.groups)) or "none"
-    raise DatasetError(
-        f"{mesh.path}: there is no point field {name!r}; there are: {fields}; groups of nodes: {groups}; places are"
-        " written BODY:PLACE, for example 0:zmin"
-    )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -28,8 +28,13 @@ _TENSORS = {(count,) for count in _ORDERS}
 # A tensor of plane stress, as arrays of two rows and two columns have it.
 _IN_THE_PLANE = ("xx", "xy", "yx", "yy")
 
+_PAIRS = ("xy", "yz", "xz")
+
 # Units of stress in pascal.
 STRESS_UNITS = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "GPa": 1e9, "psi": 6894.757293168}
+
+# A stress is symmetric if the components of a pair, such as xy and yx, differ by less than this share of the largest.
+_SYMMETRIC = 1e-3
 
 _AXES = {"1": "x", "2": "y", "3": "z", **{axis: axis for axis in "xyz"}}
 
@@ -151,9 +156,11 @@ def of_components(frame: SourceMesh, name: str, given: tuple[str, ...]) -> Sourc
     both = [_held(frame.path, name, fields) for fields in (at_points, of_cells)]
     if not any(both):
         return frame
-    solid = any(block.dimension == 3 for block in frame.blocks)
-    orders = [given] if given else [_NORMAL_FIRST, *([] if solid else [_ORDERS[4]])]
+    usual = [_NORMAL_FIRST, *([] if _is_solid(frame) else [_ORDERS[4]])]
+    orders = [given] if given else usual
     whole = [(held, order) for held in both for order in orders if {*order} <= held.keys()]
+    if whole and not given and all(held[pair] is not held[pair[::-1]] for held, _ in whole[:1] for pair in _PAIRS):
+        whole = [(whole[0][0], _ORDERS[9])]
     if not whole:
         there = max(both, key=len)
         lacking = ", ".join(component for component in orders[-1] if component not in there)
@@ -221,7 +228,8 @@ def stress_place(
             stems = " or ".join(map(repr, stems_of(known)))
             parts = f"; a stress whose components are fields is named by what these have in common: {stems}"
             listed = ", ".join(known) or "none"
-            told = f"there is no field {stress!r}; there are: {listed}{parts if stems else ''}"
+            why = next((f": {note}" for note in frame.notes if repr(stress) in note), "")
+            told = f"there is no field {stress!r}{why}; there are: {listed}{parts if stems else ''}"
             raise DatasetError(f"{frame.path}: {told}")
         return "none", (), []
     whole = stem_of(name, [*frame.point_fields, *frame.cell_fields])
@@ -229,12 +237,51 @@ def stress_place(
         raise DatasetError(f"{frame.path}: {name!r} is one component of a stress: name what all have, {whole!r}")
     values = raw_field(frame, "point" if on_points else "cell", name)
     order = order_of(frame.path, name, values, frame.columns.get(name, ()), given)
+    if len(order) == 4 and not given and _is_solid(frame):
+        raise DatasetError(
+            f"{frame.path}: the field {name!r} has the components {', '.join(order)}, and the stress of a body with a"
+            " volume has six: write all of them, or the von Mises stress; if the others are 0, say"
+            f" stress_order=({', '.join(map(repr, order))}) (--stress-order {','.join(order)})"
+        )
     notes: list[str] = []
     if on_points and on_cells:
         notes.append(f"{name!r} is a field of points and one of cells: the one of points is taken")
     if order:
         notes.append(f"the von Mises stress is computed from the components {', '.join(order)} of {name!r}")
     return "node" if on_points else "element", order, notes
+
+
+def _is_solid(frame: SourceMesh) -> bool:
+    return any(block.dimension == 3 for block in frame.blocks)
+
+
+@dataclass
+class Symmetry:
+    """The largest component of a stress in all frames, and where xy and yx, or another pair, differ most."""
+
+    largest: float = 0.0
+    off: float = 0.0
+    told: str = ""
+
+    def look(self, path: Path, values: np.ndarray, order: tuple[str, ...]) -> None:
+        """Take the stress of a frame, [rows, columns]."""
+        columns = dict(zip(order, values.T, strict=False))
+        self.largest = float(np.nanmax(np.abs(values), initial=self.largest)) if order else self.largest
+        for pair in _PAIRS:
+            if {pair, pair[::-1]} <= columns.keys():
+                with np.errstate(invalid="ignore"):  # infinite values are told elsewhere
+                    off = float(np.nanmax(np.abs(columns[pair] - columns[pair[::-1]]), initial=0.0))
+                if off > self.off:
+                    self.off = off
+                    self.told = f"{pair} and {pair[::-1]} differ by up to {off:.3g} in {path.name}"
+
+    def require(self, source: Path, name: str) -> None:
+        """Raise DatasetError if the stress is not symmetric, by more than rounding."""
+        if self.off > _SYMMETRIC * self.largest:
+            raise DatasetError(
+                f"{source}: {name!r} is not symmetric: {self.told}, and its largest component is {self.largest:.3g}: is"
+                " it the first Piola-Kirchhoff stress, or a gradient? Write Cauchy's stress, or the von Mises stress"
+            )
 
 
 def von_mises(values: np.ndarray, order: tuple[str, ...]) -> np.ndarray:

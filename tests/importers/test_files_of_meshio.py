@@ -126,6 +126,23 @@ def test_cards_of_nastran_that_say_nothing_of_elements_are_passed_over(tmp_path,
     assert volume(nastran(tmp_path, WHOLE.replace(GRIDS, in_space))) == pytest.approx(1)
 
 
+@pytest.mark.parametrize("again", ["=,*1,=,*1,*1,*1,*1", "=       *1", "=(3)", "==", "  =,*1"])
+def test_cards_of_nastran_that_repeat_the_one_before_are_refused(tmp_path, again):
+    """Such lines make elements and points of others; passed over, a part of the mesh would be missing."""
+    with pytest.raises(DatasetError, match=r"a.bdf: line \d+ repeats the card before it \('='\), which is not read"):
+        nastran(tmp_path, f"{WHOLE}{again}\n")
+
+
+def test_cards_of_nastran_that_are_no_part_of_a_mesh_are_told(tmp_path):
+    more = "RBE2,7,1,123456,2,3\nCONM2,8,1,,1.\nconm2*  9\n*\nCBUSH,9,1,1,2\nRBE3    11\nMAT1,1,2.1e5,,0.3\nPBUSH,1\n"
+    (tmp_path / "more.inc").write_text(more)
+    for text in (WHOLE + more, WHOLE + "INCLUDE 'more.inc'\n"):
+        told = "cards that are no part of a mesh are left out: 1 CBUSH, 2 CONM2, 1 RBE2, 1 RBE3"
+        assert told in nastran(tmp_path, text).notes
+    (tmp_path / "b.bdf").write_text(f"SOL 101\nCEND\nMPC = 3\nBEGIN BULK\n{WHOLE}ENDDATA\nRBE2,7,1,123456,2,3\n")
+    assert not any("cards" in note for note in read_mesh(tmp_path / "b.bdf").notes)
+
+
 @pytest.mark.parametrize("end", [" " * 8, "+       ", "", "+A1"])
 def test_a_card_of_nastran_goes_on_in_the_next_line(tmp_path, end):
     """An editor that strips lines makes meshio leave out the second line of an element."""

@@ -39,12 +39,16 @@ def as_xdmf(folder, order):
     return folder / "a.xdmf"
 
 
-def as_vtu(folder, fields, of_cells=None, names="f_{}.vtu"):
+FLAT = ("triangle", CUBE.elements[:, :3])
+PLANE = ("xx", "yy", "zz", "xy")
+
+
+def as_vtu(folder, fields, of_cells=None, names="f_{}.vtu", kind=("tetra", CUBE.elements)):
     folder.mkdir(exist_ok=True)
     for frame in range(3):
         points = {"displacement": pressed(frame), **{name: make(frame) for name, make in fields.items()}}
         cells = {name: [make(frame)] for name, make in (of_cells or {}).items()}
-        mesh = meshio.Mesh(POINTS, [("tetra", CUBE.elements)], point_data=points, cell_data=cells)
+        mesh = meshio.Mesh(POINTS, [kind], point_data=points, cell_data=cells)
         mesh.write(folder / names.format(frame))
     return folder
 
@@ -72,7 +76,7 @@ def test_nine_components_in_xdmf_need_no_order(tmp_path):
 
 @pytest.mark.parametrize("order", [("xx", "yy", "zz", "xy"), ("xx", "xy", "yx", "yy")])
 def test_four_components_of_which_two_are_equal_need_their_order(tmp_path, order):
-    source = as_vtu(tmp_path, {"s": lambda frame: columns(order, frame)})
+    source = as_vtu(tmp_path, {"s": lambda frame: columns(order, frame)}, kind=FLAT)
     if order[1] == "xy":
         with pytest.raises(DatasetError, match="the second and the third are equal in all rows, as xy and yx are"):
             read(source, stress="s")
@@ -82,8 +86,44 @@ def test_four_components_of_which_two_are_equal_need_their_order(tmp_path, order
 
 
 def test_no_stress_across_the_plane_is_no_doubt(tmp_path):
-    source = as_vtu(tmp_path, {"s": lambda frame: columns(("xx", "yy", "zz", "xy"), frame) * (1, 0, 0, 1)})
+    source = as_vtu(tmp_path, {"s": lambda frame: columns(PLANE, frame) * (1, 0, 0, 1)}, kind=FLAT)
     assert read(source, stress="s").stress[2].max() == pytest.approx(2 * np.sqrt(1 + 3 * 8**2))
+
+
+def test_four_components_of_a_body_with_a_volume_need_their_order(tmp_path):
+    source = as_vtu(tmp_path, {"s": lambda frame: columns(PLANE, frame)})
+    with pytest.raises(DatasetError, match="'s' has the components xx, yy, zz, xy, and .* of a body with a volume has"):
+        read(source, stress="s")
+    assert read(source, stress="s", stress_order=PLANE).stress[2].max() == pytest.approx(2 * np.sqrt(7 + 3 * 8**2))
+
+
+@pytest.mark.parametrize(("one", "other"), [("xy", "yx"), ("yz", "zy"), ("xz", "zx")])
+@pytest.mark.parametrize("how", ["nine columns", "nine fields", "rows in fields", "in the plane"])
+def test_a_stress_that_is_not_symmetric_is_refused(tmp_path, one, other, how):
+    """The first Piola-Kirchhoff stress is none from which a von Mises stress follows; noise at rest is no reason."""
+
+    def tensor(frame, share):
+        values = columns(FULL, frame) + 1e-12 * np.arange(9) * (frame == 0)
+        values[3, FULL.index(other)] *= share
+        return values
+
+    fields = {
+        "nine columns": lambda share: {"P": lambda frame: tensor(frame, share)},
+        "nine fields": lambda share: {
+            f"P_{part}": lambda frame, at=at: tensor(frame, share)[:, at] for at, part in enumerate(FULL)
+        },
+        "rows in fields": lambda share: {
+            f"P_{axis}": lambda frame, at=at: tensor(frame, share)[:, 3 * at : 3 * at + 3]
+            for at, axis in enumerate("xyz")
+        },
+        "in the plane": lambda share: {"P": lambda frame: tensor(frame, share)[:, [0, 1, 3, 4]]},
+    }[how]
+    more = {"stress_order": ("xx", "xy", "yx", "yy")} if how == "in the plane" else {}
+    assert read(as_vtu(tmp_path, fields(1.0005), kind=FLAT), stress="P", **more).stress[2].max() > 0
+    if more and one != "xy":
+        return
+    with pytest.raises(DatasetError, match=f"'P' is not symmetric: {one} and {other} differ by up to .* in f_2.vtu"):
+        read(as_vtu(tmp_path, fields(0.9), kind=FLAT), stress="P", **more)
 
 
 @pytest.mark.parametrize(("names", "right"), [("SX SXY SXZ SY SYZ SZ", True), ("XX XY XZ YY YZ Z1", False)])
@@ -140,7 +180,8 @@ def test_a_stress_in_fields_of_its_components_is_put_together(tmp_path, stress, 
     result = read(as_vtu(tmp_path, *((fields,) if at == "node" else ({}, fields))), stress=stress)
     assert result.stress_at == at
     np.testing.assert_allclose(result.stress[:, 0, 0], [0, IN_SPACE, 2 * IN_SPACE], rtol=1e-6)
-    assert f"is computed from the components xx, yy, zz, xy, yz, xz of '{stress}'" in notes(result)
+    listed = "xx, xy, xz, yx, yy, yz, zx, zy, zz" if order == FULL else "xx, yy, zz, xy, yz, xz"
+    assert f"is computed from the components {listed} of '{stress}'" in notes(result)
 
 
 def test_normal_stresses_of_one_letter_are_components(tmp_path):
@@ -209,6 +250,40 @@ def test_marks_below_zero_are_told(tmp_path, unmarked, told):
     assert (
         "the field 'fix' is negative at 4 nodes: they are marked, as all where it is not 0" in notes(trajectory)
     ) == told
+
+
+@pytest.mark.parametrize(
+    ("handle", "obstacle", "told"),
+    [
+        (POINTS[:, 2] == 0, 0 * POINTS[:, 2], "'tool' marks no node"),
+        (0 * POINTS[:, 2], POINTS[:, 2] >= 0, "'fix' marks no node"),
+        (POINTS[:, 2] == 0, POINTS[:, 2] >= 0, "4 nodes of 'fix' are in 'tool', too: obstacles, not handles"),
+        (POINTS[:, 2] == 0, POINTS.sum(axis=1) == 3, "1 node of 'tool' belongs to a body that deforms, and an obst"),
+        (POINTS[:, 2] == 0, POINTS[:, 2] == 1, ""),
+    ],
+)
+def test_marks_that_say_nothing_or_two_things_are_told(tmp_path, handle, obstacle, told):
+    source = as_vtu(tmp_path, {"fix": lambda _: 1.0 * handle, "tool": lambda _: 1.0 * obstacle})
+    said = notes(read(source, handle="fix", obstacle="tool"))
+    assert told in said and ("mark" in said or "'tool'" in said) == bool(told)
+
+
+@pytest.mark.parametrize("same", [True, False])
+def test_a_field_with_the_name_of_a_group_of_other_nodes_is_told(tmp_path, same):
+    corners = "1 0 0 0\n2 1 0 0\n3 0 1 0\n4 0 0 1\n5 1 1 1\n"
+    marked = range(1, 5) if same else (1, 5)
+    for frame in range(2):
+        moved = "".join(f"{node} 0 0 {-0.1 * frame * node}\n" for node in range(1, 6))
+        marks = "".join(f"{node} 1\n" for node in marked)
+        (tmp_path / f"f{frame}.msh").write_text(
+            '$MeshFormat\n2.2 0 8\n$EndMeshFormat\n$PhysicalNames\n1\n3 1 "tool"\n$EndPhysicalNames\n'
+            f"$Nodes\n5\n{corners}$EndNodes\n$Elements\n2\n1 4 2 1 1 1 2 3 4\n2 4 2 0 1 2 3 4 5\n$EndElements\n"
+            f'$NodeData\n1\n"displacement"\n1\n{frame}\n3\n0\n3\n5\n{moved}$EndNodeData\n'
+            f'$NodeData\n1\n"tool"\n1\n{frame}\n3\n0\n1\n{len(marked)}\n{marks}$EndNodeData\n'
+        )
+    result = read(tmp_path, handle="tool")
+    assert ("'tool' is a field of points and a group of other nodes: the field is taken" in notes(result)) != same
+    assert result.scene.prescribed.sum() == len(marked)
 
 
 @pytest.mark.parametrize(("kind", "nodes"), [(24, 10), (71, 10), (78, 4)])

@@ -2,6 +2,7 @@
 arrays of a piece by their places in the list of the first."""
 
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,7 +10,10 @@ import pyvista
 from blocks import block
 from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
 
+from ast_sim.importers.formats.source_mesh import CellBlock, SourceMesh
+from ast_sim.importers.formats.together import together
 from ast_sim.importers.mesh_file import read_mesh
+from ast_sim.importers.stress import stress_place
 from ast_sim.support.errors import DatasetError
 
 SCENES = block(1, 1, 1), block(2, 2, 1)
@@ -123,3 +127,46 @@ def test_a_field_without_a_name_is_refused(tmp_path, name, place):
     (tmp_path / "f.vtu").write_text(text.replace(old, name))
     with pytest.raises(DatasetError, match=rf"f\.vtu: .* an array of its {place} has no name: name it"):
         read_mesh(tmp_path / "f.vtu")
+
+
+NORMAL_FIRST = ("XX", "YY", "ZZ", "XY", "YZ", "XZ")
+BY_ROWS = ("XX", "XY", "XZ", "YY", "YZ", "ZZ")
+
+
+def called(names, place, columns=6):
+    """A mesh of one tetrahedron whose tensor has columns of these names; "XX" is 1, "YY" is 2 and so on."""
+    values = [1.0 + NORMAL_FIRST.index(name) if name in NORMAL_FIRST else 9.0 for name in names or NORMAL_FIRST]
+    at = np.tile(values[:columns], (4 if place == "point" else 1, 1))
+    fields = {"point_fields": {"S": at}} if place == "point" else {"cell_fields": {"S": [at]}}
+    blocks = [CellBlock("tetra", np.array([[0, 1, 2, 3]]), "tetra")]
+    named = {"S": tuple(names[:columns])} if names else {}
+    return SourceMesh(Path("a.vtu"), np.eye(4, 3), blocks, columns=named, **fields)
+
+
+@pytest.mark.parametrize("place", ["point", "cell"])
+@pytest.mark.parametrize("orders", [(NORMAL_FIRST, BY_ROWS), (BY_ROWS, NORMAL_FIRST), (BY_ROWS, BY_ROWS)])
+def test_columns_of_parts_are_put_in_the_order_of_their_names(place, orders):
+    mesh = together([called(names, place) for names in orders])
+    held = mesh.point_fields["S"] if place == "point" else np.concatenate(mesh.cell_fields["S"])
+    right = [1.0 + NORMAL_FIRST.index(name) for name in mesh.columns["S"]]
+    assert mesh.columns["S"] == orders[0] and mesh.notes == []
+    np.testing.assert_array_equal(held, np.tile(right, (len(held), 1)))
+
+
+@pytest.mark.parametrize("orders", [(BY_ROWS, ()), ((), BY_ROWS), (BY_ROWS, ("A", *BY_ROWS[1:]))])
+@pytest.mark.parametrize("place", ["point", "cell"])
+def test_tensors_of_parts_whose_columns_have_other_names_are_left_out(orders, place):
+    mesh = together([called(names, place) for names in orders])
+    assert not mesh.point_fields and not mesh.cell_fields and "S" not in mesh.columns
+    assert re.match("the columns of the field 'S' are called .* in different blocks: it is left out", mesh.notes[0])
+    with pytest.raises(DatasetError, match="there is no field 'S': the columns of the field 'S' are called"):
+        stress_place(mesh, "S", ())
+
+
+@pytest.mark.parametrize("orders", [((), ()), (BY_ROWS, None), (NORMAL_FIRST[:3], ())])
+def test_vectors_and_fields_of_one_part_are_kept(orders):
+    columns = 3 if len(orders[0]) == 3 else 6
+    meshes = [called(names or (), "point", columns) for names in orders]
+    if orders[1] is None:
+        del meshes[1].point_fields["S"]
+    assert "S" in together(meshes).point_fields

@@ -6,7 +6,9 @@ fields behind the nodes, and knows no included files.
 
 from __future__ import annotations
 
+import itertools
 import re
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -40,6 +42,24 @@ _NO_ELEMENTS = re.compile(
     r"CORD|CONM|CMASS|CELAS|CDAMP|CVISC|CTUBE|CONROD|CFAST|CWELD|CSEAM|CBEND|CBEAM3|CHBDY|CLOAD|CREEP|CAERO|CSUP|CYJOIN"
     r"|CBUSH|CGAP|CSHEAR|CEND$|CONV|CSET|CLOAD|CSSCHD|CONTACT"
 )
+
+# Cards that tie points to each other or add to them; they are told where a mesh is read without them.
+_TOLD = re.compile(
+    r"(CONM[12]|CMASS[1-4]|CELAS[1-4]|CDAMP[1-5]|CVISC|CTUBE|CONROD|CFAST|CWELD|CSEAM|CBEND|CBEAM3|CBUSH(?:1D|2D|T)?"
+    r"|CGAP|CSHEAR|RBE[123]|RBAR1?|RROD|RSPLINE|RSSCON|RTRPLT1?|MPC|SPOINT)[*,\s]"
+)
+
+
+def left_out_of_nastran(path: Path) -> list[str]:
+    """A note on the elements without a surface and on the constraints of a deck, which no mesh has, with their counts.
+
+    Raises:
+        DatasetError: an included file is missing.
+    """
+    names = (_TOLD.match(f"{row.lstrip().upper()} ") for _, row in _bulk_data(path))
+    counts = Counter(name[1] for name in names if name)
+    listed = ", ".join(f"{count} {name}" for name, count in sorted(counts.items()))
+    return [f"cards that are no part of a mesh are left out: {listed}"] if listed else []
 
 
 def plain_nastran(path: Path) -> bytes:
@@ -99,11 +119,13 @@ def _cards_of_nastran(path: Path) -> Iterator[tuple[str, list[str]]]:
     A line holds fields of 8 or 16 characters, or between commas. It goes on in the next one, which begins with a blank
     field, + or *.
     """
-    rows = list(_rows_of_nastran(path, ()))
-    start = next((number for number, (_, row) in enumerate(rows) if re.match(r"(?i)\s*BEGIN\b", row)), -1)
     card: list[str] = []
     first, mark = "", ""
-    for place, row in rows[start + 1 :]:
+    for place, row in _bulk_data(path):
+        if row.lstrip().startswith("="):
+            raise DatasetError(
+                f"{path}: {place} repeats the card before it ('='), which is not read: write each card out"
+            )
         wide = "*" in row.partition(",")[0][:8]
         size, width = (16, 4) if wide else (8, 8)
         texts = row.split(",") if "," in row else [row[:8], *(row[at : at + size] for at in range(8, 80, size))]
@@ -117,12 +139,17 @@ def _cards_of_nastran(path: Path) -> Iterator[tuple[str, list[str]]]:
                 yield first, card + 8 * [""]
             first = place
             card = [name.upper().rstrip("* "), *fields[:width]]
-        if card[0] == "ENDDATA":
-            return
         mark = fields[width] if len(fields) > width else ""
         card += [""] * (-(len(card) - 1) % width)
     if card:
         yield first, card + 8 * [""]
+
+
+def _bulk_data(path: Path) -> Iterator[tuple[str, str]]:
+    """The lines between BEGIN and ENDDATA, one or both of which may be missing."""
+    rows = list(_rows_of_nastran(path, ()))
+    start = next((number for number, (_, row) in enumerate(rows) if re.match(r"(?i)\s*BEGIN\b", row)), -1)
+    return itertools.takewhile(lambda one: not re.match(r"(?i)\s*ENDDATA\b", one[1]), rows[start + 1 :])
 
 
 def _rows_of_nastran(path: Path, within: tuple[Path, ...]) -> Iterator[tuple[str, str]]:

@@ -11,6 +11,8 @@ import numpy as np
 from ast_sim.importers.formats.source_mesh import SourceMesh
 from ast_sim.support.errors import DatasetError, counted
 
+_TENSOR = 4  # columns or more; two and three are a vector
+
 
 def labels_of(files: Sequence[str]) -> list[str]:
     """What tells the files of one frame apart: the words in their names, or else the numbers that differ; empty texts
@@ -56,6 +58,7 @@ def together(meshes: Sequence[SourceMesh]) -> SourceMesh:
     is NaN there, and a note says so. The path and the time come from the first."""
     if len(meshes) == 1:
         return meshes[0]
+    meshes, columns, said = _with_like_columns(meshes)
     starts = np.cumsum([0, *(len(mesh.points) for mesh in meshes)])
     blocks = [
         replace(block, nodes=block.nodes + start)
@@ -82,12 +85,56 @@ def together(meshes: Sequence[SourceMesh]) -> SourceMesh:
         point_fields,
         {name: [v[a:b] for a, b in zip(ends, ends[1:], strict=False)] for name, v in cell_fields.items()},
         groups,
-        list(dict.fromkeys([note for mesh in meshes for note in mesh.notes] + notes + more)),
+        list(dict.fromkeys([note for mesh in meshes for note in mesh.notes] + said + notes + more)),
         meshes[0].time,
-        {name: columns for mesh in meshes for name, columns in mesh.columns.items()},
+        columns,
         np.concatenate(with_ids) if len(with_ids) == len(meshes) else None,
         *_pieces(meshes),
     )
+
+
+def _with_like_columns(
+    meshes: Sequence[SourceMesh],
+) -> tuple[Sequence[SourceMesh], dict[str, tuple[str, ...]], list[str]]:
+    """Meshes whose fields have their named columns in one order, the names of these, and notes.
+
+    A field is left out whose columns have other names in another mesh. Columns without names are taken for the named
+    ones if they are not more than three, so a vector; of a tensor the order may be another one.
+    """
+    columns = {name: names for mesh in reversed(meshes) for name, names in mesh.columns.items()}
+    notes = []
+    for name, names in [*columns.items()]:
+        holding = [mesh for mesh in meshes if name in mesh.point_fields or name in mesh.cell_fields]
+        of_each = [mesh.columns.get(name, names if len(names) < _TENSOR else ()) for mesh in holding]
+        if all(one == names for one in of_each):
+            continue
+        if all(sorted(one) == sorted(names) and len(set(one)) == len(names) for one in of_each):
+            meshes = [_permuted(mesh, name, names) for mesh in meshes]
+            continue
+        listed = " and ".join(dict.fromkeys(", ".join(one) or "nothing" for one in of_each))
+        notes.append(f"the columns of the field {name!r} are called {listed} in different blocks: it is left out")
+        meshes = [_without(mesh, name) for mesh in meshes]
+        del columns[name]
+    return meshes, columns, notes
+
+
+def _permuted(mesh: SourceMesh, name: str, names: tuple[str, ...]) -> SourceMesh:
+    """A mesh with the columns of a field in the order of their `names`."""
+    own = mesh.columns.get(name, names)
+    order = [own.index(one) for one in names]
+    points, cells = dict(mesh.point_fields), dict(mesh.cell_fields)
+    if name in points and points[name].shape[1:] == (len(names),):
+        points[name] = points[name][:, order]
+    if name in cells and all(part.shape[1:] == (len(names),) for part in cells[name]):
+        cells[name] = [part[:, order] for part in cells[name]]
+    return replace(mesh, point_fields=points, cell_fields=cells)
+
+
+def _without(mesh: SourceMesh, name: str) -> SourceMesh:
+    points, cells = dict(mesh.point_fields), dict(mesh.cell_fields)
+    points.pop(name, None)
+    cells.pop(name, None)
+    return replace(mesh, point_fields=points, cell_fields=cells)
 
 
 def _pieces(meshes: Sequence[SourceMesh]) -> tuple[np.ndarray, tuple[str, ...]]:

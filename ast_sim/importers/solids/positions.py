@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from pathlib import Path
 
 import numpy as np
 
-from ast_sim.importers.formats.source_mesh import known_as
+from ast_sim.importers.formats.source_mesh import SourceMesh, known_as
 from ast_sim.importers.shells import Shells
 from ast_sim.support.errors import DatasetError, counted, warn
 
@@ -42,10 +42,47 @@ def fields_of_vector(named: str | None, fields: Collection[str]) -> list[str]:
     return [axes[axis][0] for axis in sorted(axes)] if once else [name] if named else []
 
 
+def stems_of_vectors(fields: Collection[str]) -> list[str]:
+    """What the names of fields have in common that are one number along each axis: "U" of UX, UY and UZ."""
+    matches = [_COMPONENT.fullmatch(field.strip()) for field in fields]
+    return sorted({match[1] for match in matches if match and match[1] and match[1] not in fields})
+
+
 def told_of_components(named: str | None, fields: Collection[str]) -> list[str]:
     """A note on a displacement that is put together, if it is; see `fields_of_vector`."""
     parts = fields_of_vector(named, fields)
     return [f"the displacement is put together from {', '.join(parts)}"] if len(parts) > 1 else []
+
+
+def displacement_of(frame: SourceMesh, named: str | None, read: Callable[..., np.ndarray]) -> np.ndarray | None:
+    """The displacements of the points [n, 3] of a frame; None if it holds none. `read` is `raw_field`.
+
+    Raises:
+        DatasetError: they have other components than x, y and z, or x and y in a mesh that lies in a plane of these.
+    """
+    fields = fields_of_vector(named, frame.point_fields)
+    if not fields:
+        return None
+    value = np.concatenate([read(frame, "point", one) for one in fields], axis=1)
+    if value.shape[1] not in (2, 3):
+        held = counted(value.shape[1], "component")
+        raise DatasetError(f"{frame.path}: the displacement has {held}; must have 2 or 3")
+    if value.shape[1] == 2:
+        _require_plane(frame)
+    return np.pad(value, ((0, 0), (0, 3 - value.shape[1])))
+
+
+def _require_plane(frame: SourceMesh) -> None:
+    """Raise DatasetError unless a mesh lies in a plane of x and y: a displacement of two components is along these."""
+    if any(block.dimension == 3 for block in frame.blocks):
+        raise DatasetError(f"{frame.path}: the displacement of a body with a volume has 2 components; must have 3")
+    points = frame.points[np.concatenate([np.zeros(0, np.int64), *(block.nodes.ravel() for block in frame.blocks)])]
+    low, high = points[:, 2].min(initial=np.inf), points[:, 2].max(initial=-np.inf)
+    if high - low > _AGREEMENT * np.ptp(points, axis=0).max(initial=0.0):
+        raise DatasetError(
+            f"{frame.path}: the displacement has 2 components, which are taken for x and y, but the mesh does not lie"
+            f" in a plane of these (z is {low:g} to {high:g}): write 3 components"
+        )
 
 
 def rest_and_position(
@@ -64,7 +101,14 @@ def rest_and_position(
         frame = next(frame for frame, one in enumerate(displacements) if one is None)
         raise DatasetError(f"{source}: frame {frame} has no displacement, others have")
     moved = np.stack(given)
-    lacking = (~np.isfinite(moved).all(axis=2)).sum(axis=1)
+    no_number = ~np.isfinite(moved).all(axis=2)
+    lacking = no_number.sum(axis=1)
+    if lacking.any() and (no_number == no_number[0]).all():
+        place = ", ".join(f"{x:g}" for x in at[0][np.argmax(no_number[0])])
+        raise DatasetError(
+            f"{source}: the displacement is no number at {counted(lacking[0], 'node')} in all frames, the first at"
+            f" ({place}): does a part of the mesh lack the field? Write it for all nodes, 0 where nothing moves"
+        )
     if lacking.any():
         frame = int(np.flatnonzero(lacking)[0])
         raise DatasetError(
