@@ -101,7 +101,7 @@ def rest_and_position(
         frame = next(frame for frame, one in enumerate(displacements) if one is None)
         raise DatasetError(f"{source}: frame {frame} has no displacement, others have")
     moved = np.stack(given)
-    no_number = ~np.isfinite(moved).all(axis=2)
+    no_number = np.asarray(~np.isfinite(moved).all(axis=2))
     lacking = no_number.sum(axis=1)
     if lacking.any() and (no_number == no_number[0]).all():
         place = ", ".join(f"{x:g}" for x in at[0][np.argmax(no_number[0])])
