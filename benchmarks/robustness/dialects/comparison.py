@@ -51,10 +51,16 @@ def check(case: Case, simulation: Simulation) -> None:
     frames = len(simulation.displacement)
     without_times = case.names is not None and not case.times and frames > 1
     of_times = (rf"no times tell the {frames} frames apart: they count 0, 1, 2, \.\.\.",) if without_times else ()
-    require_told(simulation, pairs, (*case.told, *of_times), notes)
+    require_told(simulation, pairs, (*case.told, *of_times, *_of_marks(case.names, simulation)), notes)
     told = [str(one.message) for one in warned if not issubclass(one.category, DeprecationWarning)]
     if told or looks_wrong:
         raise Wrong(f"without a reason it is warned: {'; '.join([*told, *looks_wrong])}")
+
+
+def _of_marks(names: FieldNames | None, simulation: Simulation) -> list[str]:
+    """Patterns of the notes on fields that mark no node; a place, such as 0:xmin, always marks some."""
+    marks = [] if names is None else [(names.obstacle, simulation.tool), (names.handle, simulation.fixed)]
+    return [f"{name!r} marks no node" for name, nodes in marks if name and ":" not in name and not nodes.any()]
 
 
 def _compare(case: Case, simulation: Simulation) -> tuple[np.ndarray, list[str], list[str]]:
