@@ -203,10 +203,11 @@ def _read_frames(
             )
         stitching.look(frame, used_fields, fields_of_vector(names.displacement, frame.point_fields))
         constant.look(frame, cells)
-        unnamed.look(frame)
         kept.times.append(frame.time)
         kept.points.append(frame.points)
         kept.displacements.append(displacement_of(frame, names.displacement, raw_field))
+        if kept.displacements[-1] is None:
+            unnamed.look(frame)
         further.look(frame, cells, raw_field)
         if place != "none":
             name = names.stress or "von_mises"
@@ -226,7 +227,7 @@ def _read_frames(
     symmetry.require(source, names.stress or "von_mises")
     notes += [*constant.notes(), *told_of_components(names.displacement, first.point_fields)]
     notes += _put_in_order_of_time(source, kept, further)
-    if kept.displacements[0] is None:
+    if all(one is None for one in kept.displacements):
         unnamed.require_at_rest(source, kept.points)
     return mesh_of(first, stitching, corners), kept, notes, place
 
