@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from exodus_made import ELEMENTS, POINTS, UNWRITTEN, Netcdf, attribute, exodus, listed, text
 
-from ast_sim.importers.formats.exodus.exodus_files import exodus_facts, node_numbers, require_whole_exodus, says_times
+from ast_sim.importers.formats.exodus.exodus_files import exodus_facts, node_numbers, require_whole_exodus
 from ast_sim.importers.formats.exodus.exodus_groups import groups_in
 from ast_sim.importers.formats.exodus.exodus_pieces import is_first_piece, is_piece
 from ast_sim.importers.formats.exodus.netcdf_head import read_netcdf_head
@@ -124,7 +124,7 @@ def test_values_that_do_not_fit_their_names_are_damage(tmp_path):
 
 def test_what_is_neither_kind_is_left_to_vtk(tmp_path):
     (tmp_path / "a.g").write_bytes(b"what is this?")
-    assert exodus_facts(tmp_path / "a.g") is None and says_times(tmp_path / "a.g")
+    assert exodus_facts(tmp_path / "a.g") is None and require_whole_exodus(tmp_path / "a.g") is None
     assert not holds_frames(tmp_path / "a.g")
 
 

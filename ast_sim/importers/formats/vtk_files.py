@@ -28,7 +28,7 @@ from ast_sim.importers.formats.declared_sizes import (
 )
 from ast_sim.importers.formats.dyna_files import require_no_deleted, require_whole, with_nodes
 from ast_sim.importers.formats.exodus import EXODUS
-from ast_sim.importers.formats.exodus.exodus_files import is_hdf, require_whole_exodus, says_times
+from ast_sim.importers.formats.exodus.exodus_files import is_hdf, require_whole_exodus
 from ast_sim.importers.formats.exodus.exodus_groups import groups_in
 from ast_sim.importers.formats.exodus.unwritten import with_nan, written_time
 from ast_sim.importers.formats.frd_given_up import is_left_out
@@ -152,10 +152,8 @@ class _Checked(NamedTuple):
 def _checked(path: Path) -> _Checked:
     ending = path.suffix.lower()
     size = path.stat().st_size
-    timed = True
-    if ending in EXODUS:
-        require_whole_exodus(path)
-        timed = says_times(path)
+    exodus = require_whole_exodus(path) if ending in EXODUS else None
+    timed = exodus is None or exodus.timed  # else VTK counts the frames 0, 1, 2, ...
     if ending in (".vtu", ".vtp", ".vts"):
         declared = declared_in_xml(path)
         budget = _OWN_BYTES + _COPIES * (needed_bytes(declared) + size)

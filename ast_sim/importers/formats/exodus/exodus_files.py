@@ -129,15 +129,12 @@ def _kind_of(cells: Any) -> tuple[str, int]:
     return (kind.decode("latin-1") if isinstance(kind, bytes) else str(kind)).strip("\0 "), int(cells.shape[-1])
 
 
-def says_times(path: Path) -> bool:
-    """Whether an Exodus file says the times of its frames: VTK counts them 0, 1, 2, ... where it does not."""
-    facts = exodus_facts(path)
-    return facts is None or facts.timed
-
-
-def require_whole_exodus(path: Path) -> None:
+def require_whole_exodus(path: Path) -> ExodusFacts | None:
     """Check that an Exodus file of the classic NetCDF kind has the bytes that its head declares, that results do not go
     on in files with other meshes (job.e-s002 beside job.e), and that VTK reads the blocks as they are.
+
+    Returns:
+        What it says, as `exodus_facts`.
 
     Raises:
         DatasetError: they do, or it is cut off: VTK takes zeros for what is missing; or VTK would take other nodes.
@@ -147,7 +144,7 @@ def require_whole_exodus(path: Path) -> None:
         raise DatasetError(f"{path}: goes on in {further[0].name} with another mesh; the mesh must not change")
     facts = exodus_facts(path)
     if facts is None:
-        return
+        return None
     wrong = [(kind, nodes) for kind, nodes in facts.kinds if nodes not in _NODES.get(kind[:3].upper(), (nodes,))]
     if wrong:
         kind, nodes = wrong[0]
@@ -168,3 +165,4 @@ def require_whole_exodus(path: Path) -> None:
             f"{path}: its {facts.texts[0]} is a text of any length (NC_STRING), and VTK reads characters (NC_CHAR):"
             " write it in letters of ASCII"
         )
+    return facts
