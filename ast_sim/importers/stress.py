@@ -156,7 +156,7 @@ def of_components(frame: SourceMesh, name: str, given: tuple[str, ...]) -> Sourc
     both = [_held(frame.path, name, fields) for fields in (at_points, of_cells)]
     if not any(both):
         return frame
-    usual = [_NORMAL_FIRST, *([] if _is_solid(frame) else [_ORDERS[4]])]
+    usual = [_NORMAL_FIRST, *([] if frame.is_solid else [_ORDERS[4]])]
     orders = [given] if given else usual
     whole = [(held, order) for held in both for order in orders if {*order} <= held.keys()]
     if whole and not given and all(held[pair] is not held[pair[::-1]] for held, _ in whole[:1] for pair in _PAIRS):
@@ -237,7 +237,7 @@ def stress_place(
         raise DatasetError(f"{frame.path}: {name!r} is one component of a stress: name what all have, {whole!r}")
     values = raw_field(frame, "point" if on_points else "cell", name)
     order = order_of(frame.path, name, values, frame.columns.get(name, ()), given)
-    if len(order) == 4 and not given and _is_solid(frame):
+    if len(order) == 4 and not given and frame.is_solid:
         raise DatasetError(
             f"{frame.path}: the field {name!r} has the components {', '.join(order)}, and the stress of a body with a"
             " volume has six: write all of them, or the von Mises stress; if the others are 0, say"
@@ -249,10 +249,6 @@ def stress_place(
     if order:
         notes.append(f"the von Mises stress is computed from the components {', '.join(order)} of {name!r}")
     return "node" if on_points else "element", order, notes
-
-
-def _is_solid(frame: SourceMesh) -> bool:
-    return any(block.dimension == 3 for block in frame.blocks)
 
 
 @dataclass

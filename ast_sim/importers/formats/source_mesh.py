@@ -131,6 +131,11 @@ class SourceMesh:
     piece_names: tuple[str, ...] = ()
     other_way: bool = False
 
+    @property
+    def is_solid(self) -> bool:
+        """Whether some cells have a volume."""
+        return any(block.dimension == 3 for block in self.blocks)
+
     def require_consistent(self) -> None:
         """Check that cells refer to points that there are, that these are finite, and that each field has a row for
         each point or cell.

@@ -74,7 +74,7 @@ def displacement_of(frame: SourceMesh, named: str | None, read: Callable[..., np
 
 def _require_plane(frame: SourceMesh) -> None:
     """Raise DatasetError unless a mesh lies in a plane of x and y: a displacement of two components is along these."""
-    if any(block.dimension == 3 for block in frame.blocks):
+    if frame.is_solid:
         raise DatasetError(f"{frame.path}: the displacement of a body with a volume has 2 components; must have 3")
     points = frame.points[np.concatenate([np.zeros(0, np.int64), *(block.nodes.ravel() for block in frame.blocks)])]
     low, high = points[:, 2].min(initial=np.inf), points[:, 2].max(initial=-np.inf)
