@@ -54,7 +54,7 @@ class Plan:
         seeds: of the trainings; the run of the first one ships.
     """
 
-    nodes: int = 3400
+    nodes: int = 3500
     train: int = 80
     valid: int = 6
     test: int = 30

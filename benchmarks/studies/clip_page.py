@@ -47,7 +47,7 @@ _VARIANTS = """
 
 The same scenes solved with other settings, {count} of the test scenes ({first} to {last}). Errors are relative to
 the scene's own mesh, as the run's are. A frame of the dataset is solved in at least 4 increments; two steps are the
-ram's way out and back, which is all that both numbers need. Where CalculiX finds no solution on a coarser mesh, or does
+ram's way out and back, which is all that both numbers need. Where CalculiX finds no solution on a mesh, or does
 not end, meshes of nearly that size are tried, and the failed tries cost nothing here. Meshing is counted on neither
 side.
 """

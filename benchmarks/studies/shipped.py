@@ -2,7 +2,7 @@
 
 `python -m benchmarks.studies.shipped [NAME ...]` (or `make shipped`, both) writes ast_sim/example_runs/NAME.ast. Data
 and runs lie in `--folder`; a second call goes on with what is there. On one thread plates take about 100
-minutes (Zen 5), the clip about 190 (Xeon), of which CalculiX takes 140.
+minutes (Zen 5), the clip about 270 (Xeon, beside other work), of which CalculiX takes 185.
 """
 
 from __future__ import annotations

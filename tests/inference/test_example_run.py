@@ -72,7 +72,7 @@ def test_a_clip_that_is_asked_for_by_its_parameters_has_the_set_and_the_force_of
         names = ("length", "thickness", "place", "travel", "yield_stress")
         parameters = {name: known["parameters"][name] for name in names}
         parameters["file"] = {"clip": known["parameters"]["clip.file"]}
-        answer = run.predict(spec=SPEC, parameters=parameters, nodes=3400)
+        answer = run.predict(spec=SPEC, parameters=parameters, nodes=3500)
         said = outcome(answer.scene, answer.position[0], answer.position[-1], answer.fields[REACTION].values)
         assert said == pytest.approx(tuple(known["true"].values()), rel=0.1)
         assert answer.fields["PEEQ"].values[-1].max() > 0.01 and answer.frames == tuple(range(LAST + 1))
@@ -90,7 +90,7 @@ def test_ten_scenes_of_the_repository_have_the_errors_of_the_page():
             said = outcome(truth.scene, truth.position[0], answer.position[-1], answer.fields[REACTION].values)
             of_page = np.array(tuple(known[name]["run_two_frames"].values())) / true - 1
             np.testing.assert_allclose(np.array(said) / true - 1, of_page, atol=1e-3)
-            assert np.all(np.abs(of_page) < (0.04, 0.09))  # set and force
+            assert np.all(np.abs(of_page) < (0.03, 0.05))  # set and force
 
 
 def true_sets(rows):
@@ -109,7 +109,7 @@ def true_sets(rows):
 def test_travels_that_end_at_one_place_leave_sets_as_far_apart_as_in_true_scenes():
     """In the last frame the ram is back, whatever its travel: what differs is where it turned. From one travel to the
     next the true sets grow by the factors 2.4 and 1.6."""
-    sweep = ast_sim.example_run("clip").sweep(SPEC, {"travel": [1.2, 2.4, 3.6]}, nodes=3400)
+    sweep = ast_sim.example_run("clip").sweep(SPEC, {"travel": [1.2, 2.4, 3.6]}, nodes=3500)
     assert [row["travel_of_nodes"] for row in sweep.rows] == [0, 0, 0]
     sets = np.array([row["permanent_set"] for row in sweep.rows])
     true = true_sets(sweep.rows)
