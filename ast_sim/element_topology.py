@@ -14,6 +14,9 @@ from ast_sim.support.read_only_arrays import kept
 # What meshio calls an element, by the number of its nodes.
 CELL_KINDS = {3: "triangle", 4: "tetra", 10: "tetra10"}
 
+# An attribute of a simulation, and an entry of `DatasetInfo.generator`: elements of a higher order keep their corners.
+CORNERS_ONLY = "corners_only"
+
 # The faces of a tetrahedron with positive volume; their normals point outward.
 LOCAL_FACES = ((0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3))
 

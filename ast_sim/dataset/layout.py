@@ -11,6 +11,7 @@ from typing import Any, Literal, get_args
 import h5py
 import numpy as np
 
+from ast_sim.element_topology import CORNERS_ONLY
 from ast_sim.material import FRICTION, POISSON, YOUNG, Material
 from ast_sim.number_arrays import real_numbers, three_numbers
 from ast_sim.scene import AttributeValue, Scene
@@ -38,7 +39,6 @@ FRAMED = ("position", "stress", "cauchy_stress")
 FIELDS = "fields"  # the group of the named fields of a trajectory; each is an array of this kind
 FIELD_KIND = (np.float32, 3)
 NUMBERING = ("frames", "times")  # attributes of a trajectory that tell of its frames; they may be missing
-CORNERS_ONLY = "corners_only"  # an entry of `DatasetInfo.generator`, and an attribute of a trajectory
 LENGTH_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254}  # in metres
 Integration = Literal["quasi_static", "dynamic"]
 StressLocation = Literal["none", "node", "element"]

@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from ast_sim.dataset.layout import CORNERS_ONLY, SPLITS
+from ast_sim.dataset.layout import SPLITS
 from ast_sim.dataset.writer import FittedWriter
+from ast_sim.element_topology import CORNERS_ONLY
 from ast_sim.importers.completeness import require_complete
 from ast_sim.importers.deepmind import convert_deepmind, is_deepmind
 from ast_sim.importers.frames_in_file import ONE_FRAME, WITH_FRAMES, holds_frames

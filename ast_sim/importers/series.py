@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ast_sim.dataset.layout import CORNERS_ONLY
+from ast_sim.element_topology import CORNERS_ONLY
 from ast_sim.importers.formats.source_mesh import SourceMesh
 from ast_sim.importers.formats.together import labelled, require_one_time, together
 from ast_sim.importers.frames_in_file import frames_in, only_frame

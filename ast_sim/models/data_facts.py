@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-from ast_sim.dataset.layout import CORNERS_ONLY, GIVEN_FRAMES, DatasetInfo, Integration, StressLocation
+from ast_sim.dataset.layout import GIVEN_FRAMES, DatasetInfo, Integration, StressLocation
+from ast_sim.element_topology import CORNERS_ONLY
 from ast_sim.material import FRICTION, Material
 from ast_sim.named_field import STRESS, Output
 from ast_sim.support.toml_settings import NOTHING

@@ -1,7 +1,7 @@
 """What looks wrong in the frames of a simulation: tools that change their shape, displacements in other units, elements
 that turn over, frames that stop dead, bodies that change their places, displacements from the frame before, no motion,
-Poisson's ratios, yield stresses and stresses that cannot be one, plastic strains of elastic bodies, contact that no
-model can see.
+Poisson's ratios, yield stresses and stresses that cannot be one, plastic strains of elastic bodies, reactions with the
+other sign, contact that no model can see.
 
 Legend: S frames, N nodes, E elements.
 """
@@ -21,6 +21,7 @@ from ast_sim.plausibility.increments import counted_from_frame_before
 from ast_sim.plausibility.plastic_strain import plastic_but_elastic
 from ast_sim.plausibility.topology import at_rest
 from ast_sim.plausibility.units import yielding
+from ast_sim.plausibility.work_of_reactions import negative_work
 from ast_sim.scene import Scene, Trajectory
 
 # Edges of an obstacle keep their lengths up to this share of the longest edge.
@@ -62,6 +63,8 @@ def in_trajectory(trajectory: Trajectory, dynamic: bool = False) -> list[Finding
         findings += _stops_dead(position)
     elif "source" in trajectory.attributes:  # of other programs: of the bundled solver, a pause is one
         findings += _pauses(position)
+    if not dynamic:
+        findings += negative_work(trajectory)
     findings += negative_stress(trajectory)
     findings += [*change_places(scene, position), *counted_from_frame_before(scene, position)]
     return [*findings, *_contact(scene, position)]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ast_sim.dataset.layout import CORNERS_ONLY
+from ast_sim.element_topology import CORNERS_ONLY
 from ast_sim.importers.mesh_file import read_mesh
 from ast_sim.importers.series import FieldNames, read_series
 from ast_sim.plausibility.motion import in_trajectory
