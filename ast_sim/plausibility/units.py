@@ -27,9 +27,10 @@ _LEAST = 20
 _SMALL = 0.02
 _ROUNDING = 100.0
 
-# Stress, divided by strain and Young's modulus, of anything that is solid.
+# Stress, divided by strain and Young's modulus, of anything that is solid. It is at most about 1.5; fibres across which
+# Young's modulus was taken have up to 50. Displacements in metres beside a mesh in millimetres make it a thousand.
 _LEAST_RATIO = 1e-5
-_MOST_RATIO = 1e4
+_MOST_RATIO = 100.0
 
 # Between simulations: a factor that no yielding makes, and a factor for bodies that do not yield: in these, the
 # logarithm of stress divided by strain varies by less than this share of the logarithm of strain.
@@ -101,7 +102,10 @@ def other_stress(known: Sequence[tuple[str, Stiffness]]) -> list[tuple[str, Find
     told = []
     for name, one in known:
         if one.by_modulus and not _LEAST_RATIO < one.middle < _MOST_RATIO:
-            meaning = "it must be about 1, less where a body yields: is the stress or Young's modulus in another unit?"
+            meaning = (
+                "it must be about 1, less where a body yields: is the stress, Young's modulus or the displacement in"
+                " another unit?"
+            )
             where = f"stress divided by strain and Young's modulus is {one.middle:.3g}"
             told.append((name, Finding("simulations whose stress does not go with their modulus", 1, where, meaning)))
     wrong = {name for name, _ in told}

@@ -57,11 +57,23 @@ def test_a_stress_in_another_unit_is_told(at, factor):
     assert told(simulations) == [(2, STRESS)]
 
 
-@pytest.mark.parametrize(("factor", "what"), [(1e-6, MODULUS), (1e-3, STRESS), (1e3, STRESS), (1e6, MODULUS)])
+@pytest.mark.parametrize(("factor", "what"), [(1e-6, MODULUS), (1e-3, STRESS), (1e3, MODULUS), (1e6, MODULUS)])
 def test_a_stress_is_measured_by_the_modulus_where_there_is_one(factor, what):
     simulations = several(material=STEEL)
     simulations[0] = with_stress(simulations[0], factor)
     assert told(simulations) == [(0, what)]
+
+
+def test_a_displacement_in_metres_beside_a_mesh_in_millimetres_is_told():
+    """In all simulations alike, each by itself."""
+    simulations = [simulation(np.random.default_rng(0), (3, 2, 1), STEEL, press=press) for press in (0.1, 0.2, 0.3)]
+    small = [
+        replace(one, position=(rest + (one.position.astype(float) - rest) / 1000).astype(np.float32))
+        for one in simulations
+        for rest in [one.scene.rest_position]
+    ]
+    assert told(simulations) == []
+    assert told(small) == [(row, MODULUS) for row in range(3)]
 
 
 def test_the_modulus_alone_in_another_unit_is_told_by_the_stress():
