@@ -101,7 +101,7 @@ def _figures(results: dict[str, Any]) -> list[str]:
         )
     return [
         *lines,
-        f"- The run: {plan['train']} scenes of about {plan['nodes']:,} nodes, {plan['steps']:,} steps in"
+        f"- The run: {plan['train']} scenes, meshed for {plan['nodes']:,} nodes, {plan['steps']:,} steps in"
         f" {duration(results['training_seconds'])}, {results['parameters']:,} weights. CalculiX took"
         f" {duration(simulated['train'] + simulated['valid'])} for the scenes of training and validation.",
         f"- Errors of the run in the field, medians: displacement {_median(scenes, 'turn_error')} when the ram turns,"
