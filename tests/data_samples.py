@@ -19,6 +19,7 @@ from ast_sim.dataset.layout import (
     write_attributes,
 )
 from ast_sim.dataset.writer import DatasetWriter
+from ast_sim.element_topology import signed_volumes, turned_over
 from ast_sim.scene import NodeType, Scene, Trajectory
 from ast_sim.simulate.shapes.mesh import second_order
 
@@ -33,10 +34,11 @@ def block(nx: int, ny: int, nz: int, material: np.ndarray | None = None) -> Scen
     # Each tetrahedron follows one path of the three axes from corner 000 to corner 111.
     paths = [((1, 0, 0), (1, 1, 0)), ((1, 0, 0), (1, 0, 1)), ((0, 1, 0), (1, 1, 0))]
     paths += [((0, 1, 0), (0, 1, 1)), ((0, 0, 1), (1, 0, 1)), ((0, 0, 1), (0, 1, 1))]
-    elements = [np.stack([corner[0, 0, 0], corner[a], corner[b], corner[1, 1, 1]], 1) for a, b in paths]
+    elements = np.array([np.stack([corner[0, 0, 0], corner[a], corner[b], corner[1, 1, 1]], 1) for a, b in paths])
+    elements = elements.reshape(-1, 4).astype(np.int32)
     return Scene(
         rest_position=points.astype(np.float32),
-        elements=np.concatenate(elements).astype(np.int32),
+        elements=turned_over(elements, signed_volumes(points, elements) < 0),
         node_type=np.where(points[:, 0] == 0, NodeType.HANDLE, NodeType.NORMAL).astype(np.uint8),
         body=np.zeros(len(points), np.int32),
         material=material,

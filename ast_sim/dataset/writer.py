@@ -25,12 +25,13 @@ from ast_sim.dataset.layout import (
     trajectory_hash,
     write_attributes,
 )
+from ast_sim.element_topology import turned_over
 from ast_sim.material import hints
 from ast_sim.named_field import require_same_fields
 from ast_sim.scene import Scene, Trajectory
 from ast_sim.support.argument_checks import file_name, require_type
 from ast_sim.support.disk import Disk, output_file, sync_folder, temporary_name
-from ast_sim.support.errors import DatasetError, warn
+from ast_sim.support.errors import DatasetError, counted, warn
 
 # On each side the domain is larger than the positions by this share of their largest extent.
 MARGIN = 0.1
@@ -57,6 +58,7 @@ class DatasetWriter:
         self.counts = dict.fromkeys(SPLITS, 0)
         self._kind: tuple[int, int] | None = None  # (nodes per element, material width) of all trajectories
         self._fields: dict[str, tuple[str, str, int]] | None = None  # the named fields of all trajectories
+        self._turned: dict[str, int] = {}  # trajectories, and how many of their tetrahedra were turned over
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._file_path = output_file(self.path)
@@ -68,7 +70,11 @@ class DatasetWriter:
         self._file = h5py.File(self._disk, "w", libver=("v110", "v110"))
 
     def add(self, split: str, trajectory: Trajectory) -> None:
-        """Check a trajectory and append it to the split "train", "valid", "test" or "calibration"."""
+        """Check a trajectory and append it to the split "train", "valid", "test" or "calibration".
+
+        Tetrahedra that are inside out are turned over, so that a file has the same bytes however its elements were
+        numbered; at its end a warning counts them.
+        """
         if not self._is_open:
             raise DatasetError(
                 f"{self.path}: add in the block of `with DatasetWriter(...)`, at whose end it is written"
@@ -79,6 +85,7 @@ class DatasetWriter:
         require_type("the attributes", trajectory.attributes, Mapping, "values by name")
         name = f"{split}/{self.counts[split]:06d}"
         trajectory.check(f"{self.path}: {name}", self.info.stress_location)
+        trajectory = self._right_side_out(name, trajectory)
         first = self._kind is None
         self._kind = require_kind(f"{self.path}: {name}", trajectory.scene, self._kind)
         self._require_material(f"{self.path}: {name}", trajectory.scene, first)
@@ -100,6 +107,13 @@ class DatasetWriter:
             attributes = {key: plain_value(value) for key, value in group.attrs.items()}
             write_attributes(group, {HASH: trajectory_hash(hashes, attributes)})
         self.counts[split] += 1
+
+    def _right_side_out(self, name: str, trajectory: Trajectory) -> Trajectory:
+        scene = trajectory.scene
+        if scene.elements.shape[1] == 3 or not (wrong := scene.rest_volumes < 0).any():
+            return trajectory
+        self._turned[name] = int(wrong.sum())
+        return replace(trajectory, scene=replace(scene, elements=turned_over(scene.elements, wrong)))
 
     def _require_material(self, name: str, scene: Scene, first: bool) -> None:
         """Raise DatasetError unless the material has a name for each column and numbers that a material can have; the
@@ -177,6 +191,12 @@ class DatasetWriter:
         with self._writing():
             os.replace(self._temporary, self._file_path)
             sync_folder(self._file_path.parent)
+        if self._turned:
+            are = counted(
+                sum(self._turned.values()), "tetrahedron that was inside out is", "tetrahedra that were inside out are"
+            )
+            within = counted(len(self._turned), "simulation", "simulations")
+            warn(f"{self.path}: {are} turned over, in {within}, the first is {next(iter(self._turned))}")
 
 
 class FittedWriter(DatasetWriter):

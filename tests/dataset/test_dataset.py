@@ -14,7 +14,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from data_samples import block, info, sign, trajectory, write
+from data_samples import block, info, raised, sign, trajectory, write
 from meshes import two_tetrahedra
 
 from ast_sim.dataset import reader as dataset_file
@@ -667,3 +667,17 @@ def test_another_process_opens_a_dataset_from_any_folder(tmp_path, monkeypatch):
     received = pickle.loads(sent)[0]
     assert received.length_unit == "mm"
     assert np.allclose(received.position, 1000 * some()["train"][0].position, rtol=1e-6)
+
+
+@pytest.mark.parametrize("second_order", [False, True])
+def test_tetrahedra_that_are_inside_out_are_turned_over(tmp_path, second_order):
+    """So a dataset has the same bytes however its writer numbered them."""
+    scene = raised(block(2, 1, 1)) if second_order else block(2, 1, 1)
+    order = [0, 1, 3, 2, 4, 8, 7, 6, 5, 9][: scene.elements.shape[1]]
+    numbered = scene.elements.copy()
+    numbered[::2] = numbered[::2][:, order]
+    position = np.stack([scene.rest_position, scene.rest_position * np.float32(1.1)])
+    straight = write(tmp_path / "straight.h5", {"test": [Trajectory(scene, position)]})
+    with pytest.warns(UserWarning, match=r"6 tetrahedra that were inside out are turned over, in 1 sim"):
+        flipped = write(tmp_path / "flipped.h5", {"test": [Trajectory(replace(scene, elements=numbered), position)]})
+    assert flipped.read_bytes() == straight.read_bytes()

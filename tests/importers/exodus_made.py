@@ -6,7 +6,7 @@ from pathlib import Path
 
 import h5py
 import numpy as np
-from blocks import block
+from data_samples import block
 
 KINDS = {"i1": 1, "S1": 2, "i4": 4, "f4": 5, "f8": 6, "i8": 10}
 UNWRITTEN = 9.9692099683868690e36  # with which NetCDF fills places that are never written

@@ -4,7 +4,7 @@ all over is joined all the same."""
 import meshio
 import numpy as np
 import pytest
-from blocks import block
+from data_samples import block
 from test_jobs import solved
 
 from ast_sim.importers.mesh_file import read_mesh

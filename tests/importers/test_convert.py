@@ -11,8 +11,7 @@ import meshio
 import numpy as np
 import pytest
 import pyvista
-from blocks import block
-from data_samples import trajectory
+from data_samples import block, trajectory
 from vtkmodules.vtkIOHDF import vtkHDFWriter
 
 from ast_sim.dataset.reader import Dataset

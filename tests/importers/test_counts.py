@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 import pytest
 import pyvista
-from blocks import block
+from data_samples import block
 from scipy.io import netcdf_file
 from vtkmodules.vtkCommonDataModel import vtkUnstructuredGrid
 from vtkmodules.vtkIOExodus import vtkExodusIIWriter

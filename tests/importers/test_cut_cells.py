@@ -5,7 +5,7 @@ from itertools import product
 import meshio
 import numpy as np
 import pytest
-from blocks import block
+from data_samples import block
 
 from ast_sim.element_topology import signed_volumes
 from ast_sim.importers.scene_mesh import read_scene

@@ -10,7 +10,7 @@ import meshio
 import numpy as np
 import pytest
 import pyvista
-from blocks import block
+from data_samples import block
 from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter, vtkXMLUnstructuredGridWriter
 
 from ast_sim.importers.mesh_file import read_mesh

@@ -6,7 +6,7 @@ from itertools import product
 import meshio
 import numpy as np
 import pytest
-from blocks import block
+from data_samples import block
 from exodus_made import Netcdf, exodus
 
 from ast_sim.element_topology import MIDDLES, signed_volumes, slopes_at, turned_over

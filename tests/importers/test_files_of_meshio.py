@@ -5,7 +5,7 @@ import re
 import meshio
 import numpy as np
 import pytest
-from blocks import block
+from data_samples import block
 
 from ast_sim.importers.mesh_file import read_mesh
 from ast_sim.simulate.shapes.mesh import second_order

@@ -3,7 +3,7 @@
 import meshio
 import numpy as np
 import pytest
-from blocks import block
+from data_samples import block
 
 from ast_sim.importers.convert import convert
 from ast_sim.importers.series import FieldNames, read_series

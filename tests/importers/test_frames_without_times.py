@@ -4,7 +4,7 @@ import meshio
 import numpy as np
 import pytest
 import pyvista
-from blocks import block
+from data_samples import block
 from exodus_made import exodus, nodal
 
 from ast_sim.dataset.reader import Dataset

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from blocks import block
+from data_samples import block
 
 from ast_sim import Dataset, cli
 from ast_sim.importers.convert import convert

@@ -4,7 +4,7 @@ marks that are not a number, bodies that lie in each other at rest."""
 import meshio
 import numpy as np
 import pytest
-from blocks import block
+from data_samples import block
 
 from ast_sim import cli
 from ast_sim.importers.decks.deck_mesh import deck_mesh

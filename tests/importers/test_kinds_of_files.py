@@ -5,7 +5,7 @@ import meshio
 import numpy as np
 import pytest
 import pyvista
-from blocks import block
+from data_samples import block
 from vtkmodules.vtkCommonDataModel import vtkPartitionedDataSet, vtkPartitionedDataSetCollection
 from vtkmodules.vtkIOParallelXML import vtkXMLPartitionedDataSetCollectionWriter, vtkXMLPartitionedDataSetWriter
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from blocks import block
+from data_samples import block
 from test_jobs import solved
 
 from ast_sim.importers.series import FieldNames, read_series

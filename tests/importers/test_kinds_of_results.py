@@ -6,7 +6,7 @@ import meshio
 import numpy as np
 import pytest
 import pyvista
-from blocks import block
+from data_samples import block
 from scipy.io import netcdf_file
 
 from ast_sim.importers.mesh_file import read_mesh

@@ -7,7 +7,7 @@ import meshio
 import numpy as np
 import pytest
 import pyvista
-from blocks import block
+from data_samples import block
 from vtkmodules.vtkIOHDF import vtkHDFWriter
 
 from ast_sim.importers.convert import find_series

@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 import pytest
 import pyvista
-from blocks import block
+from data_samples import block
 
 from ast_sim.importers.mesh_file import read_mesh
 from ast_sim.support.errors import DatasetError

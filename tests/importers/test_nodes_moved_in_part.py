@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import test_kinds_of_jobs
-from blocks import block
+from data_samples import block
 from test_jobs import solved
 from test_kinds_of_jobs import (
     CUBE,

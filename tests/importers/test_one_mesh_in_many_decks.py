@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 import pytest
-from blocks import block
+from data_samples import block
 
 from ast_sim.importers.mesh_file import read_mesh
 from ast_sim.importers.scene_mesh import read_scene

@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 import pyvista
-from blocks import block
+from data_samples import block
 from vtkmodules.vtkCommonCore import vtkIdTypeArray
 
 from ast_sim.importers.convert import find_series

@@ -7,7 +7,7 @@ import h5py
 import numpy as np
 import pytest
 import pyvista
-from blocks import block
+from data_samples import block
 from vtkmodules.util.numpy_support import numpy_to_vtkIdTypeArray
 from vtkmodules.vtkCommonDataModel import vtkCompositeDataSet, vtkMultiBlockDataSet
 from vtkmodules.vtkIOXML import vtkXMLMultiBlockDataWriter, vtkXMLUnstructuredGridWriter

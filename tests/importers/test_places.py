@@ -3,7 +3,7 @@
 import meshio
 import numpy as np
 import pytest
-from blocks import block
+from data_samples import block
 from meshes import plate_and_punch
 from simulate.own_assembly.assemblies import SPEC, case_of, write_assembly
 

@@ -7,7 +7,7 @@ import subprocess
 
 import numpy as np
 import pytest
-from blocks import block
+from data_samples import block
 from test_jobs import faces_at
 
 import ast_sim

@@ -9,7 +9,7 @@ from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
-from blocks import block
+from data_samples import block
 from test_bodies_of_one_element import CORNERS
 
 from ast_sim import Dataset, cli

@@ -6,7 +6,7 @@ import warnings
 import meshio
 import numpy as np
 import pytest
-from blocks import block
+from data_samples import block
 
 import ast_sim
 from ast_sim import Dataset, cli

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from blocks import block
+from data_samples import block
 
 from ast_sim.importers.mesh_file import read_mesh
 from ast_sim.support.errors import DatasetError

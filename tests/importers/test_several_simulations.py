@@ -3,7 +3,7 @@
 import meshio
 import numpy as np
 import pytest
-from blocks import block
+from data_samples import block
 
 from ast_sim.cli import main
 from ast_sim.dataset.contents import describe_dataset

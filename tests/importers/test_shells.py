@@ -3,7 +3,7 @@
 import meshio
 import numpy as np
 import pytest
-from blocks import block
+from data_samples import block
 from meshes import box_between
 
 from ast_sim.dataset.reader import Dataset

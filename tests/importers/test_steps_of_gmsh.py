@@ -6,7 +6,7 @@ import sys
 import meshio
 import numpy as np
 import pytest
-from blocks import block
+from data_samples import block
 
 from ast_sim.importers.convert import convert, find_series
 from ast_sim.importers.scene_mesh import read_scene

@@ -4,7 +4,7 @@ import meshio
 import numpy as np
 import pytest
 import pyvista
-from blocks import block
+from data_samples import block
 
 from ast_sim.importers.mesh_file import read_mesh
 from ast_sim.importers.series import FieldNames, read_series

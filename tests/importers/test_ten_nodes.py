@@ -5,7 +5,7 @@ from itertools import product
 import meshio
 import numpy as np
 import pytest
-from blocks import block
+from data_samples import block
 
 from ast_sim.element_topology import MIDDLES, linear_elements, signed_volumes
 from ast_sim.importers.mesh_file import read_mesh

@@ -4,7 +4,7 @@ import subprocess
 from dataclasses import replace
 
 import pytest
-from blocks import block
+from data_samples import block
 
 from ast_sim.importers.series import FieldNames, read_series
 from ast_sim.support.errors import DatasetError

@@ -5,7 +5,7 @@ from dataclasses import replace
 import meshio
 import numpy as np
 import pytest
-from blocks import block
+from data_samples import block
 from varied_sets import simulation, turned, varied_set
 
 from ast_sim.importers.convert import convert

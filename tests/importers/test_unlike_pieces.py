@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import pyvista
-from blocks import block
+from data_samples import block
 from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
 
 from ast_sim.importers.formats.source_mesh import CellBlock, SourceMesh

@@ -3,7 +3,7 @@
 import h5py
 import numpy as np
 import pytest
-from blocks import block
+from data_samples import block
 
 from ast_sim.importers.frames_in_file import frames_in
 from ast_sim.importers.series import FieldNames, read_series

@@ -4,7 +4,7 @@ from dataclasses import replace
 from itertools import permutations
 
 import numpy as np
-from blocks import block
+from data_samples import block
 
 from ast_sim.scene import NodeType, Scene, Trajectory
 
