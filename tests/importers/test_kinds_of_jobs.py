@@ -231,6 +231,29 @@ def test_increments_that_do_not_follow_each_other_in_time_are_refused(tmp_path):
         read(solved(tmp_path, cube(*reset)))
 
 
+def test_modes_with_damping_are_no_frames(tmp_path):
+    """Their headers do not say that they are modes, and their times are frequencies."""
+    frequencies = ["*STEP", "*FREQUENCY, STORAGE=YES", "2", "*END STEP"]
+    turning = ["*DLOAD", "ALL, CENTRIF, 1e4, 0., 0., 0., 0., 0., 1.", "*NODE FILE", "U", "*END STEP"]
+    modes = ["*STEP", "*COMPLEX FREQUENCY, CORIOLIS", "2", *turning]
+    job = solved(tmp_path, cube(frequencies, modes, material=["*DENSITY", "7e-9"]))
+    assert re.findall(r"100CL.{49}(..)", job[1].read_text()) == [" 3", " 3"]
+    for named, deck in ((NAMES, job[0]), (FieldNames(displacement="DISP"), None)):
+        with pytest.raises(DatasetError, match="job.frd: holds modes of vibration, which are no frames of a motion"):
+            read_series(job[1], named, deck=deck)
+
+
+@pytest.mark.parametrize("name", ["DISP", "STRESS"])
+def test_a_result_of_an_increment_stands_once(tmp_path, name):
+    """Of two a reader takes the last."""
+    job = solved(tmp_path, cube(step(*moved(-0.1))))
+    results = job[1].read_text()
+    first = re.search(rf"(?s)  100CL[^\n]*\n -4  {name} .*?\n -3\n", results)[0]
+    job[1].write_text(results.replace(first, first + first.replace("E-02", "E-03")))
+    with pytest.raises(DatasetError, match=f"job.frd: holds {name} 2 times for the time 0.5: is it put together of"):
+        read(job)
+
+
 # The nodes of the faces of a tetrahedron, as CalculiX counts them.
 FACES = ((0, 1, 2), (0, 3, 1), (1, 3, 2), (2, 3, 0))
 
