@@ -294,6 +294,21 @@ def test_jobs_are_taken_whatever_their_boundary_says(tmp_path, model, steps):
     assert len(read(solved(tmp_path, cube(*steps, model=model, material=["*DENSITY", "7e-9"]))).position) > 1
 
 
+@pytest.mark.parametrize("quote", ["", '"'])
+def test_spaces_and_quotes_in_names_have_no_meaning(tmp_path, quote):
+    """CalculiX leaves the spaces of each line out."""
+    lines = cube(step("*BOUNDARY", f"{quote}The Top{quote}, 1, 2", f"{quote}TheTop{quote}, 3, 3, -0.1"))
+    replaced = {
+        "*NSET, NSET=TOP": f"*NSET, NSET={quote}The Top{quote}",
+        "*MATERIAL, NAME=M": f"*MATERIAL, NAME={quote}Soft one{quote}",
+        "*SOLID SECTION, ELSET=ALL, MATERIAL=M": f"*SOLID SECTION, ELSET=A LL, MATERIAL={quote}SOFTONE{quote}",
+    }
+    trajectory = read(solved(tmp_path, [replaced.get(line, line) for line in lines]))
+    top = trajectory.scene.rest_position[:, 2] == 2
+    assert (trajectory.scene.node_type[top] == NodeType.HANDLE).all() and top.sum() == 9
+    np.testing.assert_allclose(trajectory.scene.material, [[1e9, 0.3]] * len(trajectory.scene.elements), rtol=1e-6)
+
+
 # The nodes of the faces of a tetrahedron, as CalculiX counts them.
 FACES = ((0, 1, 2), (0, 3, 1), (1, 3, 2), (2, 3, 0))
 
