@@ -50,7 +50,7 @@ def holds_frames(path: Path) -> bool:
     """Whether a file holds all frames of a simulation. The first of the pieces of a parallel run stands for all."""
     ending = path.suffix.lower()
     if ending in XDMF:
-        return re.search(rb"GridType\s*=\s*[\"']Collection", path.read_bytes()) is not None
+        return re.search(rb"(?i)GridType\s*=\s*[\"']Collection", path.read_bytes()) is not None
     if ending in MESHES_OF_EXODUS:
         facts = exodus_facts(path)
         return facts is not None and facts.steps > 0
