@@ -74,6 +74,14 @@ def test_nodes_of_elements_of_an_instance_are_a_set(tmp_path, lines, instances):
     assert group.tolist() == [8 * instance + node for instance in instances for node in OF_FIRST]
 
 
+@pytest.mark.parametrize("lines", [["*NSET, NSET=a, ELSET=one", "8"], ["*NSET, NSET=a, ELSET=one, GENERATE", "1, 3"]])
+def test_a_set_of_elements_beside_numbers_of_nodes_is_refused(tmp_path, lines):
+    with pytest.raises(
+        DatasetError, match=r"deck.inp:\d+: \*NSET: has ELSET= and lines of data, and one of them would"
+    ):
+        read(tmp_path, *MESH, *lines)
+
+
 @pytest.mark.parametrize(("line", "kind"), [("*NSET, NSET=a, ELSET=two", "elements"), ("*NSET, NSET=a\none", "nodes")])
 def test_a_set_that_there_is_not_is_named_with_its_kind(tmp_path, line, kind):
     with pytest.raises(DatasetError, match=f"there is no set of {kind} '(two|one)' before this line"):

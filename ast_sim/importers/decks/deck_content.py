@@ -215,6 +215,8 @@ class _Reader:
             self.content.unsorted.add(name)
         members = self._sets(self.content, of_elements).setdefault(name, [])
         if not of_elements and keyword.options.get("ELSET"):
+            if keyword.data:
+                raise keyword.error("has ELSET= and lines of data, and one of them would be lost: write two sets")
             members.extend(self._named(keyword, True, instance, keyword.options["ELSET"]))
         elif keyword.options.keys() & {"GENERATE", "GEN"}:  # Abaqus reads names that are cut short
             members.append(Members(instance, _generated(keyword), of_elements))
