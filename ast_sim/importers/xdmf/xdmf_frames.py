@@ -15,7 +15,7 @@ import numpy as np
 from ast_sim.importers.formats.source_mesh import SourceMesh, from_meshio
 from ast_sim.importers.meshio_files import by_meshio, what_meshio_says
 from ast_sim.importers.xdmf.xdmf_grids import with_one_grid, with_one_series
-from ast_sim.importers.xdmf.xdmf_items import made_of_others, with_joined_points, write_out
+from ast_sim.importers.xdmf.xdmf_items import made_of_others, require_linked, with_joined_points, write_out
 from ast_sim.importers.xdmf.xdmf_spellings import (
     with_defaults,
     with_fields_of_one_step,
@@ -46,6 +46,7 @@ def xdmf_frames(path: Path) -> Iterator[SourceMesh]:
     several |= with_own_times(path, tree) | with_fields_of_one_step(tree) | with_one_series(tree)
     told = without_fields_of_grids(tree)
     _require_understood(path, tree)
+    require_linked(path, tree)
     series = tree.findall("Domain/Grid[@GridType='Collection']")
     version = str(tree.getroot().get("Version"))
     if series and version.partition(".")[0] != "3":
@@ -54,9 +55,8 @@ def xdmf_frames(path: Path) -> Iterator[SourceMesh]:
             " .pvd"
         )
     named = ", ".join(dict.fromkeys(one.get("Name", "without a name") for one in tree.iter("Set")))
-    several |= bool(told)
+    several |= bool(told) or (not series and len(tree.findall("Domain/Grid")) > 1)
     told += [f"sets are not read: {named}"] if named else []
-    several |= not series and len(tree.findall("Domain/Grid")) > 1
     told += [] if series else with_one_grid(path, tree)
     time, timed = (None, False) if series else without_time(path, tree)
     if series:
