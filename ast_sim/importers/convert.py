@@ -19,7 +19,7 @@ from ast_sim.importers.frames_in_file import ONE_FRAME, WITH_FRAMES, holds_frame
 from ast_sim.importers.job_files import decks_of, doubt_modulus, with_units
 from ast_sim.importers.order_of_files.by_name import natural_order
 from ast_sim.importers.order_of_files.frame_files import files_of_frames
-from ast_sim.importers.order_of_files.left_out import left_out
+from ast_sim.importers.order_of_files.left_out import left_out, no_pieces
 from ast_sim.importers.order_of_files.listed import SERIES
 from ast_sim.importers.series import FieldNames, read_series
 from ast_sim.material import listed_columns
@@ -238,7 +238,7 @@ def _series_in(folder: Path) -> Iterator[Path]:
     files, if there are any: both list files of frames. Files of Gmsh count if there is nothing else."""
     entries = sorted(folder.iterdir(), key=natural_order)
     files = [entry for entry in entries if entry.is_file() and not entry.name.startswith(".")]
-    collections = [entry for entry in files if entry.suffix.lower() == ".pvd" or holds_frames(entry)]
+    collections = no_pieces(entry for entry in files if entry.suffix.lower() == ".pvd" or holds_frames(entry))
     collections = collections or [entry for entry in files if entry.suffix.lower() == SERIES]
     if collections:
         for note in left_out(folder, collections):

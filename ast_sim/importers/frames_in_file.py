@@ -40,6 +40,20 @@ ONE_FRAME = (".vtu", ".pvtu", ".vtk", ".vtp", ".pvtp", ".vts", ".pvts", *BLOCKS,
 _MARK = b"\xef\xbb\xbf"
 _WITH_MARK = (".inp", ".stl", ".ele", ".node", *XML, *XDMF)
 
+# The marks of UTF-16, and the formats whose readers know them.
+_MARKS_OF_UTF_16 = (b"\xff\xfe", b"\xfe\xff")
+_IN_UTF_16 = (".inp", *XDMF)
+
+# What packed files begin with, and what packs them.
+_PACKED = {
+    b"\x1f\x8b": "gzip",
+    b"BZh": "bzip2",
+    b"\xfd7zXZ": "xz",
+    b"PK\3\4": "zip",
+    b"7z\xbc\xaf": "7-Zip",
+    b"(\xb5/\xfd": "zstd",
+}
+
 
 def is_of_known_kind(path: Path) -> bool:
     """Whether the kind of a file, by its name, is one that `frames_in` reads."""
@@ -50,11 +64,22 @@ def holds_frames(path: Path) -> bool:
     """Whether a file holds all frames of a simulation. The first of the pieces of a parallel run stands for all."""
     ending = path.suffix.lower()
     if ending in XDMF:
-        return re.search(rb"GridType\s*=\s*[\"']Collection", path.read_bytes()) is not None
+        return re.search(rb"(?i)GridType\s*=\s*[\"']Collection", path.read_bytes()) is not None
     if ending in MESHES_OF_EXODUS:
         facts = exodus_facts(path)
         return facts is not None and facts.steps > 0
     return ending in WITH_FRAMES or is_dyna(path) or is_first_piece(path) or (ending == ".msh" and has_steps(path))
+
+
+def require_unpacked(path: Path) -> None:
+    """Raise DatasetError if a file is packed, or a text in UTF-16 of a format whose reader does not know it."""
+    with path.open("rb") as file:
+        head = file.read(8)
+    packed = next((name for mark, name in _PACKED.items() if head.startswith(mark)), None)
+    if packed is not None:
+        raise DatasetError(f"{path}: is packed by {packed}: unpack it first")
+    if head.startswith(_MARKS_OF_UTF_16) and path.suffix.lower() not in _IN_UTF_16:
+        raise DatasetError(f"{path}: is a text in UTF-16: save it as UTF-8")
 
 
 def only_frame(path: Path) -> SourceMesh:
@@ -83,6 +108,7 @@ def frames_in(path: Path) -> Iterator[SourceMesh]:
     if not path.is_file():
         what = "is a folder: name a file in it" if path.is_dir() else "there is no such file"
         raise DatasetError(f"{path}: {what}")
+    require_unpacked(path)
     ending = path.suffix.lower()
     is_deck = ending == ".inp" or (ending == ".msh" and _beginning(path).startswith(b"*"))  # cgx calls a deck so
     if not is_deck and ending not in _WITH_MARK and _is_marked(path):

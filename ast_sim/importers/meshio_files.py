@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import h5py
+import numpy as np
 
 from ast_sim.importers.decks.nastran_cards import left_out_of_nastran, plain_nastran
 from ast_sim.importers.formats.source_mesh import INSTEAD, SourceMesh, from_meshio
@@ -23,6 +24,9 @@ from ast_sim.support.errors import DatasetError
 _KINDS = (".xdmf", ".xmf", ".mesh", ".meshb", ".med", ".vol", ".node", ".ele", ".ply", ".off", ".obj", ".avs")
 _NASTRAN = (".bdf", ".fem", ".nas")
 _OTHER_KINDS = (".f3grid", ".ugrid", ".xml", ".msh")  # the last as meshio writes it itself, if nobody names a format
+
+# What MED calls the place of a field that is on all nodes, or on all cells of a kind.
+_ON_ALL = "MED_NO_PROFILE_INTERNAL"
 BY_MESHIO = (*_KINDS, *_NASTRAN, *_OTHER_KINDS)
 
 
@@ -48,7 +52,7 @@ def by_meshio(path: Path, copy: Path | None = None) -> SourceMesh:
     except (Exception, SystemExit) as error:
         told = what_meshio_says(error, printed.getvalue()).replace(str(file), str(path))
         raise DatasetError(f"{path}: cannot be read as a mesh: {told}; if it is whole, {INSTEAD}") from error
-    notes = left_out_of_nastran(path) if ending in _NASTRAN else []
+    notes = _TOLD.get(ending, lambda _: [])(path)
     return replace(from_meshio(mesh, path), notes=notes, other_way=ending == ".med")
 
 
@@ -146,8 +150,10 @@ _CHECKS: dict[str, Callable[[Path], None]] = {
 
 def _plain_med(path: Path) -> bytes:
     """A MED file without the families that have no groups, for whose names meshio looks; the others have letters in
-    place of bytes."""
+    place of bytes. Its fields have a value for each node or cell."""
     copy = io.BytesIO(path.read_bytes())
+    with contextlib.suppress(OSError, KeyError, AttributeError, TypeError, ValueError), h5py.File(copy, "r+") as file:
+        _complete_fields(file)
     with contextlib.suppress(OSError, KeyError, AttributeError, TypeError), h5py.File(copy, "r+") as file:
         families: Any = file["FAS"]
         for place in [one[part] for one in families.values() for part in ("ELEME", "NOEUD") if part in one]:
@@ -157,6 +163,51 @@ def _plain_med(path: Path) -> bytes:
                 else:
                     del place[name]
     return copy.getvalue()
+
+
+def _complete_fields(file: Any) -> None:
+    """Write the fields of a MED file with a value for each node or cell, NaN where there is none: meshio stops at
+    fields on a part of the mesh. Fields with several values in a cell are left out."""
+    (mesh,) = file["ENS_MAA"].values()
+    (mesh,) = (mesh,) if "NOE" in mesh else mesh.values()
+    nodes = {"NOE": mesh["NOE"]["COO"].attrs["NBR"]}
+    cells = {f"MAI.{kind}": one["NOD"].attrs["NBR"] for kind, one in mesh["MAI"].items()}
+    for name, steps in list(file["CHA"].items()):
+        if _is_within_cells(steps):
+            del file["CHA"][name]
+            continue
+        for step in steps.values():
+            for sizes in (nodes, cells):
+                for place, size in sizes.items() if sizes.keys() & step.keys() else ():
+                    values = np.full((size, steps.attrs["NCO"]), np.nan)
+                    for profile, part in step.get(place, {}).items():
+                        rows = slice(None) if profile == _ON_ALL else file["PROFILS"][profile]["PFL"][()] - 1
+                        values[rows] = part["CO"][()].reshape(values.shape[1], -1).T
+                    _write_on_all(step, place, values)
+
+
+def _write_on_all(step: Any, place: str, values: np.ndarray) -> None:
+    if place in step:
+        del step[place]
+    part = step.create_group(f"{place}/{_ON_ALL}")
+    part.parent.attrs["PFL"] = np.bytes_(_ON_ALL)
+    part.attrs.update(NBR=len(values), NGA=1)
+    part["CO"] = values.T.ravel()
+
+
+def _is_within_cells(steps: Any) -> bool:
+    """Whether a field of a MED file has values at the nodes of each element, or at several points in it."""
+    parts = [(place, one) for step in steps.values() for place, held in step.items() for one in held.values()]
+    return any(place.startswith("NOE.") or one.attrs.get("NGA", 1) > 1 for place, one in parts)
+
+
+def _left_out_of_med(path: Path) -> list[str]:
+    """A note on the fields of a MED file that are left out."""
+    names: list[str] = []
+    with contextlib.suppress(OSError, KeyError, AttributeError), h5py.File(path, "r") as file:
+        fields: Any = file["CHA"]
+        names += [repr(name) for name, steps in fields.items() if _is_within_cells(steps)]
+    return [f"fields with several values in a cell are left out: {', '.join(names)}"] if names else []
 
 
 def _spell(groups: Any) -> None:
@@ -181,4 +232,9 @@ _PLAIN: dict[str, Callable[[Path], bytes]] = {
     ".off": plain_off,
     ".ply": plain_ply,
     **dict.fromkeys(_NASTRAN, plain_nastran),
+}
+
+_TOLD: dict[str, Callable[[Path], list[str]]] = {
+    ".med": _left_out_of_med,
+    **dict.fromkeys(_NASTRAN, left_out_of_nastran),
 }

@@ -167,6 +167,12 @@ FREE = "".join(free(1 + row, 1 + cell) for row, cell in enumerate(CUBE.elements)
 WIDE = "".join(
     f"{'GRID*':8}{1 + row:16}{'':16}{x:16}{y:16}\n{'*':8}{z:16}\n" for row, (x, y, z) in enumerate(POINTS.tolist())
 )
+FORTRAN = "".join(
+    f"{'GRID*':8}{1 + row:16}{'':16}{x:12.5f}D+00{y:12.5f}D+00\n{'*':8}{z:12.5f}D+00\n"
+    for row, (x, y, z) in enumerate(POINTS.tolist())
+)
+PADDED = "".join(f"GRID,{1 + row:05},,{x},{y},{z}\n" for row, (x, y, z) in enumerate(POINTS.tolist()))
+CELLS = list(enumerate(CUBE.elements))
 SPELLINGS = {
     "small": GRIDS + WHOLE.removeprefix(GRIDS),
     "free": GRIDS + FREE,
@@ -177,6 +183,9 @@ SPELLINGS = {
     "tabs": "".join(f"GRID\t{1 + row}\t\t{x}\t{y}\t{z}\n" for row, (x, y, z) in enumerate(POINTS.tolist())) + FREE,
     "a default of points": "GRDSET,,,,,,,6\n" + GRIDS + FREE,
     "Nastran's exponents": GRIDS.replace("1.000", "10.-1") + FREE,
+    "Fortran's exponents": FORTRAN + FREE,
+    "zeros before numbers": PADDED + FREE,
+    "zeros before nodes": GRIDS + "".join(free(1 + row, [f"{node:04}" for node in 1 + cell]) for row, cell in CELLS),
     "blank zeros": GRIDS.replace("0.000", "     ") + FREE,
 }
 

@@ -245,7 +245,9 @@ def test_what_is_held_in_some_directions_is_free_with_a_note(press, tmp_path, bo
     assert "9 nodes are held in some directions only (symmetry, sliding): they count as free" in notes
     types, notes, _ = types_of(press, tmp_path, ("FLOOR, 1, 3", "FLOOR, ENCASTRE"))
     assert (types == NodeType.HANDLE).sum() == 9 and "some directions" not in notes
-    types, _, _ = types_of(press, tmp_path, ("FLOOR, 1, 3", "FLOOR, 3, 3, 0.1"))  # it drives
+    types, _, _ = types_of(
+        press, tmp_path, ("FLOOR, 1, 3", "*BOUNDARY, AMPLITUDE=A\nFLOOR, 3, 3, 0.1\n*BOUNDARY")
+    )  # it drives
     assert (types == NodeType.HANDLE).sum() == 9
 
 

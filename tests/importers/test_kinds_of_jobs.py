@@ -190,8 +190,8 @@ def test_steps_with_heat_have_an_end(tmp_path, procedure):
     steps = [step(*moved(z), procedure=procedure) for z in (-0.1, -0.05)]
     job = solved(tmp_path, cube(*steps, model=model, material=HEAT))
     assert "the steps end at 1, 2;" in read(job).attributes["notes"]
-    job[0].write_text(job[0].read_text().replace("0.5, 1.\n", "0.5, 2.\n"))
-    with pytest.warns(UserWarning, match=r"ends at the time 2, but the steps of job.inp end at 4"):
+    job[0].write_text("0.5, 2.\n".join(job[0].read_text().rsplit("0.5, 1.\n", 1)))
+    with pytest.warns(UserWarning, match=r"ends at the time 2, but the steps of job.inp end at 3"):
         read(job)
 
 
@@ -229,6 +229,84 @@ def test_increments_that_do_not_follow_each_other_in_time_are_refused(tmp_path):
         DatasetError, match=r"the increment at the time 0\.\d stands after the one at 1: let the time go on"
     ):
         read(solved(tmp_path, cube(*reset)))
+
+
+def test_modes_with_damping_are_no_frames(tmp_path):
+    """Their headers do not say that they are modes, and their times are frequencies."""
+    frequencies = ["*STEP", "*FREQUENCY, STORAGE=YES", "2", "*END STEP"]
+    turning = ["*DLOAD", "ALL, CENTRIF, 1e4, 0., 0., 0., 0., 0., 1.", "*NODE FILE", "U", "*END STEP"]
+    modes = ["*STEP", "*COMPLEX FREQUENCY, CORIOLIS", "2", *turning]
+    job = solved(tmp_path, cube(frequencies, modes, material=["*DENSITY", "7e-9"]))
+    assert re.findall(r"100CL.{49}(..)", job[1].read_text()) == [" 3", " 3"]
+    for named, deck in ((NAMES, job[0]), (FieldNames(displacement="DISP"), None)):
+        with pytest.raises(DatasetError, match="job.frd: holds modes of vibration, which are no frames of a motion"):
+            read_series(job[1], named, deck=deck)
+
+
+@pytest.mark.parametrize("name", ["DISP", "STRESS"])
+def test_a_result_of_an_increment_stands_once(tmp_path, name):
+    """Of two a reader takes the last."""
+    job = solved(tmp_path, cube(step(*moved(-0.1))))
+    results = job[1].read_text()
+    first = re.search(rf"(?s)  100CL[^\n]*\n -4  {name} .*?\n -3\n", results)[0]
+    job[1].write_text(results.replace(first, first + first.replace("E-02", "E-03")))
+    with pytest.raises(DatasetError, match=f"job.frd: holds {name} 2 times for the time 0.5: is it put together of"):
+        read(job)
+
+
+DOWN = [step(*moved(-0.1)), step(*moved(-0.2))]
+
+
+@pytest.mark.parametrize(
+    ("steps", "node", "given"),
+    [
+        ([step(*moved(-0.1)), step(*moved(-0.3))], 3, "-0.3 along z at the time 2, and it has -0.2"),
+        ([step("*BOUNDARY", "TOP, 1, 3"), DOWN[1]], 3, "0 along z at the time 0.5, and it has -0.05"),
+        ([step("*BOUNDARY", "5, 1, 3"), DOWN[1]], 5, r"0 along z at the time 0.5, and it has -0.0\d+"),
+        ([step("*BOUNDARY", "TOP, 1, 2", "19, 1, 2, 0.05"), DOWN[1]], 19, "0.05 along x at the time 1, and it has 0"),
+    ],
+)
+def test_results_of_another_job_on_the_same_mesh_are_refused(tmp_path, steps, node, given):
+    job = solved(tmp_path, cube(*DOWN))
+    read(job)
+    other = written(tmp_path, cube(*steps))
+    cause = (
+        f"job.frd: holds results of another job than job.inp: its .BOUNDARY gives node {node} the displacement {given}"
+    )
+    with pytest.raises(DatasetError, match=cause):
+        read((other, job[1]))
+
+
+@pytest.mark.parametrize(
+    ("model", "steps"),
+    [
+        (["*AMPLITUDE, NAME=A", "0., 0., 1., 0.5"], [step(*moved(-0.1, ", AMPLITUDE=A"))]),
+        ([], [DOWN[0], step("*BOUNDARY, FIXED", "TOP, 3, 3")]),
+        ([], [DOWN[0], step("*BOUNDARY, OP=NEW", "FLOOR, 1, 3")]),
+        ([], [DOWN[0], step("*BOUNDARY, OP=NEW", "FLOOR, 1, 3", "TOP, 1, 2"), step("*BOUNDARY", "TOP, 3, 3")]),
+        (["*TRANSFORM, NSET=TOP, TYPE=R", "0., 1., 0., -1., 0., 0."], [step("*BOUNDARY", "TOP, 1, 1, 0.1")]),
+        (["*TIME POINTS, NAME=T", "0.3, 0.8"], [[one.replace("FILE", "FILE, TIME POINTS=T") for one in DOWN[0]]]),
+        ([], [step(*moved(-0.1), procedure="*DYNAMIC, DIRECT")]),
+        ([], [step(*moved(-0.1), procedure="*STATIC, TOTAL TIME AT START=3.")]),
+    ],
+)
+def test_jobs_are_taken_whatever_their_boundary_says(tmp_path, model, steps):
+    assert len(read(solved(tmp_path, cube(*steps, model=model, material=["*DENSITY", "7e-9"]))).position) > 1
+
+
+@pytest.mark.parametrize("quote", ["", '"'])
+def test_spaces_and_quotes_in_names_have_no_meaning(tmp_path, quote):
+    """CalculiX leaves the spaces of each line out."""
+    lines = cube(step("*BOUNDARY", f"{quote}The Top{quote}, 1, 2", f"{quote}TheTop{quote}, 3, 3, -0.1"))
+    replaced = {
+        "*NSET, NSET=TOP": f"*NSET, NSET={quote}The Top{quote}",
+        "*MATERIAL, NAME=M": f"*MATERIAL, NAME={quote}Soft one{quote}",
+        "*SOLID SECTION, ELSET=ALL, MATERIAL=M": f"*SOLID SECTION, ELSET=A LL, MATERIAL={quote}SOFTONE{quote}",
+    }
+    trajectory = read(solved(tmp_path, [replaced.get(line, line) for line in lines]))
+    top = trajectory.scene.rest_position[:, 2] == 2
+    assert (trajectory.scene.node_type[top] == NodeType.HANDLE).all() and top.sum() == 9
+    np.testing.assert_allclose(trajectory.scene.material, [[1e9, 0.3]] * len(trajectory.scene.elements), rtol=1e-6)
 
 
 # The nodes of the faces of a tetrahedron, as CalculiX counts them.

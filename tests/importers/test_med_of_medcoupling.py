@@ -135,3 +135,68 @@ def test_names_of_groups_may_be_of_latin_1(tmp_path):
         (family,) = (one for one in families["NOEUD"].values() if "GRO" in one)
         family["GRO/NOM"][0] = np.frombuffer("tenu à gauche".encode("latin-1").ljust(80, b"\0"), np.int8)
     assert list(read_mesh(path).groups) == ["tenu à gauche"]
+
+
+def write_with_fields(path: Path, on_nodes=None, on_cells=None, several=False) -> Path:
+    """Hexahedra, the squares around them, and fields: of all hexahedra (young), of some nodes or hexahedra, whose
+    numbers are given (mark, part: 10 times the number), at the nodes of each hexahedron (inner)."""
+    cells = grid()
+    cells.setName("mesh 0")
+    around = cells.computeSkin()
+    file = medcoupling.MEDFileUMesh()
+    file.setMeshAtLevel(0, cells)
+    file.setMeshAtLevel(-1, around)
+    meshes = medcoupling.MEDFileMeshes()
+    meshes.pushMesh(file)
+    fields = medcoupling.MEDFileFields()
+
+    def put(name, where, values, chosen=None):
+        field = medcoupling.MEDCouplingFieldDouble(where, medcoupling.ONE_TIME)
+        field.setName(name)
+        field.setTime(0.0, 0, 0)
+        field.setArray(medcoupling.DataArrayDouble([float(value) for value in values]))
+        step = medcoupling.MEDFileField1TS()
+        if chosen is None:
+            field.setMesh(cells)
+            step.setFieldNoProfileSBT(field)
+        else:
+            numbers = medcoupling.DataArrayInt64(list(chosen))
+            numbers.setName(f"places of {name}")
+            step.setFieldProfile(field, file, 0, numbers)
+        steps = medcoupling.MEDFileFieldMultiTS()
+        steps.pushBackTimeStep(step)
+        fields.pushField(steps)
+
+    put("young", medcoupling.ON_CELLS, range(1, 9))
+    if on_nodes:
+        put("mark", medcoupling.ON_NODES, [10 * number for number in on_nodes], on_nodes)
+    if on_cells:
+        put("part", medcoupling.ON_CELLS, [10 * number for number in on_cells], on_cells)
+    if several:
+        put("inner", medcoupling.ON_GAUSS_NE, range(64))
+    data = medcoupling.MEDFileData()
+    data.setMeshes(meshes)
+    data.setFields(fields)
+    data.write(str(path), 2)
+    return path
+
+
+@pytest.mark.parametrize("nodes", [None, LEFT, [20, 3, 1]])
+@pytest.mark.parametrize("cells", [None, [5, 0, 2]])
+def test_fields_may_be_on_a_part_of_the_mesh(tmp_path, nodes, cells):
+    """Here on one kind of cells, on some nodes or on some cells; elsewhere they are NaN."""
+    mesh = read_mesh(write_with_fields(tmp_path / "a.med", nodes, cells))
+    hexahedron = np.repeat(np.arange(8), 6)
+    np.testing.assert_array_equal(mesh.numbers("cell", "young"), 1 + hexahedron)
+    for name, given, read in (("mark", nodes, np.arange(27)), ("part", cells, hexahedron)):
+        fields = mesh.fields["point" if name == "mark" else "cell"]
+        assert (name in fields) == (given is not None)
+        if given is not None:
+            np.testing.assert_array_equal(fields[name], np.where(np.isin(read, given), 10.0 * read, np.nan))
+    assert not any("field" in note for note in mesh.notes)
+
+
+def test_fields_with_several_values_in_a_cell_are_left_out(tmp_path):
+    mesh = read_mesh(write_with_fields(tmp_path / "a.med", several=True))
+    assert "fields with several values in a cell are left out: 'inner'" in mesh.notes
+    assert "inner" not in mesh.fields["cell"] and "young" in mesh.fields["cell"]

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from data_samples import block
 
+from ast_sim.importers.frames_in_file import holds_frames
 from ast_sim.importers.mesh_file import read_mesh
 from ast_sim.importers.series import FieldNames, read_series
 from ast_sim.support.errors import DatasetError
@@ -110,6 +111,33 @@ def test_functions_of_finite_elements_are_refused_by_name(tmp_path):
     frames = [topology() + geometry() + displacement(frame, facts) for frame in FRAMES]
     with pytest.raises(DatasetError, match="'displacement' has its values at the place 'Other': .*not by write_check"):
         read_series(series(tmp_path / "a.xdmf", frames), FieldNames(handle="0:zmin"))
+
+
+@pytest.mark.parametrize(
+    "word",
+    ["Collection", "Temporal", "Tetrahedron", "XYZ", "Int", "Float", "XML", "Node"],
+)
+@pytest.mark.parametrize("case", [str.upper, str.lower])
+def test_words_may_be_in_capital_or_small_letters(tmp_path, word, case):
+    """As XDMF takes them; meshio knows one spelling."""
+    frames = [topology() + geometry() + displacement(frame) for frame in FRAMES]
+    path = series(tmp_path / "a.xdmf", frames)
+    text = path.read_text()
+    assert f'"{word}"' in text
+    path.write_text(text.replace(f'"{word}"', f'"{case(word)}"'))
+    require_right(path)
+    assert holds_frames(path)
+
+
+def test_remarks_and_fields_of_whole_grids_are_left_out(tmp_path):
+    remark = '<Information Name="made by" Value="hand"/>'
+    step = f'<Attribute Name="dt" Center="Grid" AttributeType="Scalar">{item(np.array([0.1]))}</Attribute>'
+    frames = [remark + topology() + geometry() + displacement(frame) + step for frame in FRAMES]
+    path = series(tmp_path / "a.xdmf", frames)
+    path.write_text(path.read_text().replace('"Temporal">', f'"Temporal">{remark}'))
+    require_right(path)
+    notes = read_series(path, FieldNames(handle="0:zmin")).attributes["notes"]
+    assert "fields with one value for the whole grid are left out: 'dt'" in notes
 
 
 SHARED = (

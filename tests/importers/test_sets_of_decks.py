@@ -33,8 +33,24 @@ def read(folder, *lines):
         (["*ELSET, ELSET=two", "one", "*NSET, NSET=a, ELSET=two"], OF_FIRST),
         (["*NSET, NSET=a", "of one", "*NSET, NSET=of one", "8"], OF_FIRST),
         (["*NSET, NSET=a, ELSET=one", "*ELSET, ELSET=one", "2"], OF_FIRST),
+        (["*NSET, NSET=a", "OfOne"], OF_FIRST),
+        (["*NSET, NSET=a", '"of one"'], OF_FIRST),
+        (["*ELSET, ELSET=o n e 2", "1", "*NSET, NSET=a, ELSET=one2"], OF_FIRST),
+        (["*NSET, NSET=ofone", "8", "*NSET, NSET=a", "ofone"], [7]),
+        (["*NSET, NSET=ofone", "8", "*NSET, NSET=a", "of one"], OF_FIRST),
     ],
-    ids=["a set", "and a node", "in two lines", "a set of a set", "a set of elements", "later nodes", "later elements"],
+    ids=[
+        *(
+            "a set",
+            "and a node",
+            "in two lines",
+            "a set of a set",
+            "a set of elements",
+            "later nodes",
+            "later elements",
+        ),
+        *("without spaces", "in quotes", "elements without spaces", "one without", "one with spaces"),
+    ],
 )
 def test_a_set_has_what_the_sets_in_it_have_at_its_line(tmp_path, lines, nodes):
     assert read(tmp_path, *MESH, *lines).groups["a"].tolist() == nodes
@@ -49,11 +65,21 @@ def test_a_set_has_what_the_sets_in_it_have_at_its_line(tmp_path, lines, nodes):
         (["*NSET, NSET=a, INSTANCE=high, ELSET=one"], [1]),
         (["*NSET, NSET=a, ELSET=high.one"], [1]),
         (["*ELSET, ELSET=b, INSTANCE=low", "one", "*NSET, NSET=a, ELSET=b"], [0]),
+        (["*NSET, NSET=a", "high.ofone"], [1]),
+        (["*NSET, NSET=a, INSTANCE=h igh", "of one"], [1]),
     ],
 )
 def test_nodes_of_elements_of_an_instance_are_a_set(tmp_path, lines, instances):
     group = read(tmp_path, *PARTS, *lines, "*END ASSEMBLY").groups["a"]
     assert group.tolist() == [8 * instance + node for instance in instances for node in OF_FIRST]
+
+
+@pytest.mark.parametrize("lines", [["*NSET, NSET=a, ELSET=one", "8"], ["*NSET, NSET=a, ELSET=one, GENERATE", "1, 3"]])
+def test_a_set_of_elements_beside_numbers_of_nodes_is_refused(tmp_path, lines):
+    with pytest.raises(
+        DatasetError, match=r"deck.inp:\d+: \*NSET: has ELSET= and lines of data, and one of them would"
+    ):
+        read(tmp_path, *MESH, *lines)
 
 
 @pytest.mark.parametrize(("line", "kind"), [("*NSET, NSET=a, ELSET=two", "elements"), ("*NSET, NSET=a\none", "nodes")])

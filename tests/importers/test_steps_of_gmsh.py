@@ -131,6 +131,24 @@ def test_steps_that_do_not_fit_are_refused(tmp_path, sections, cause):
         read_series(written(tmp_path / "run.msh", marks(), *sections), NAMES)
 
 
+def test_fields_whose_steps_have_other_numbers_are_told_with_these(tmp_path):
+    sections = [one for n in (0, 1) for one in (of_step(n, n / 2, n / 10)[0], of_step(n + 1, n / 2, n / 10)[1])]
+    cause = "'u' has 2 steps, from step 0 at the time 0 on, 'mises' has 2, from step 1 at 0 on: write all fields at the"
+    with pytest.raises(DatasetError, match=cause):
+        read_series(written(tmp_path / "run.msh", marks(), *sections), NAMES)
+
+
+def test_a_field_at_the_nodes_of_elements_is_left_out_by_name(tmp_path):
+    moves = [of_step(*step)[0] for step in STEPS]
+    stress = [section("ElementNodeData", "mises", number, time, np.ones((6, 5))) for number, time, _ in STEPS]
+    path = written(tmp_path / "run.msh", marks(), *moves, *stress)
+    left_out = "the field 'mises' has values at the nodes of each element: it is left out"
+    read = read_series(path, FieldNames(displacement="u", handle="held"))
+    assert read.attributes["notes"].count(left_out) == 1
+    with pytest.raises(DatasetError, match=f"there is no field 'mises': {left_out}; there are: "):
+        read_series(path, NAMES)
+
+
 def test_each_file_with_steps_is_a_simulation(tmp_path):
     for name in "ab":
         written(tmp_path / f"{name}.msh", marks(), *[one for step in STEPS for one in of_step(*step)])

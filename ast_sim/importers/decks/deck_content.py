@@ -17,7 +17,7 @@ from ast_sim.importers.decks.deck_axes import from_angles, placement_of, system_
 from ast_sim.importers.decks.deck_numbers import elements_of, nodes_in, nodes_of, tokens, whole
 from ast_sim.importers.decks.deck_parts import Content, Deck, ElementBlock, Instance, Members, Sets, UsersOwn
 from ast_sim.importers.decks.element_types import is_users_own, kind_of
-from ast_sim.importers.decks.keyword_lines import Keyword, read_keywords
+from ast_sim.importers.decks.keyword_lines import Keyword, known_key, read_keywords
 from ast_sim.importers.decks.made_from_others import elements_made, nodes_made
 from ast_sim.importers.formats.source_mesh import node_count
 from ast_sim.support.errors import DatasetError, counted
@@ -207,7 +207,7 @@ class _Reader:
 
     def _set(self, keyword: Keyword) -> None:
         name = self._key(keyword.required(keyword.name))
-        instance = keyword.options.get("INSTANCE", "").upper()
+        instance = known_key(keyword.options.get("INSTANCE", ""), self.deck.instances)
         if instance and instance not in self.deck.instances:
             raise keyword.error(f"there is no instance {keyword.options['INSTANCE']!r}")
         of_elements = keyword.name == "ELSET"
@@ -215,6 +215,8 @@ class _Reader:
             self.content.unsorted.add(name)
         members = self._sets(self.content, of_elements).setdefault(name, [])
         if not of_elements and keyword.options.get("ELSET"):
+            if keyword.data:
+                raise keyword.error("has ELSET= and lines of data, and one of them would be lost: write two sets")
             members.extend(self._named(keyword, True, instance, keyword.options["ELSET"]))
         elif keyword.options.keys() & {"GENERATE", "GEN"}:  # Abaqus reads names that are cut short
             members.append(Members(instance, _generated(keyword), of_elements))
@@ -241,8 +243,8 @@ class _Reader:
 
     def _named(self, keyword: Keyword, of_elements: bool, instance: str, text: str) -> list[Members]:
         """The members of a set, or a node or an element of an instance; all with the ones that sets have now."""
-        key = text.upper()
         sets = self._sets(self.content, of_elements)
+        key = known_key(text, sets)
         if not instance and key in sets:
             return list(sets[key])
         if not instance:
@@ -252,7 +254,7 @@ class _Reader:
                 return [Members(instance, np.array([int(key)]), of_elements)]
             one = self.deck.instances[instance]
             of_parts = [self._sets(content, of_elements) for content in (one.part, one.own)]
-            parts = [sets[key] for sets in of_parts if key in sets]
+            parts = [sets[known_key(key, sets)] for sets in of_parts if known_key(key, sets) in sets]
             if parts:
                 return [some._replace(instance=instance) for members in parts for some in members]
         kind = "elements" if of_elements else "nodes"
@@ -270,7 +272,7 @@ class _Reader:
 
     def _instance(self, keyword: Keyword) -> None:
         name = self._key(keyword.required("NAME"))
-        part = keyword.required("PART").upper()
+        part = known_key(keyword.required("PART"), self.deck.parts)
         if part not in self.deck.parts:
             raise keyword.error(f"there is no part {keyword.options['PART']!r} before this line")
         if name in self.deck.instances:

@@ -8,7 +8,7 @@ module knows no keyword but that one.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -60,6 +60,18 @@ class Keyword:
         if not self.options.get(option):
             raise self.error(f"has no {option}=")
         return self.options[option]
+
+
+def known_key(name: str, known: Collection[str]) -> str:
+    """Which of the known names, in upper case, a name means. Quotes are no part of it. Spaces have no meaning, as in
+    CalculiX, unless they tell two of the known names apart."""
+    key = name.strip('"').upper()
+    alike = [] if key in known else [one for one in known if _without_spaces(one) == _without_spaces(key)]
+    return alike[0] if len(alike) == 1 else key
+
+
+def _without_spaces(name: str) -> str:
+    return "".join(name.split())
 
 
 def read_keywords(path: Path) -> list[Keyword]:

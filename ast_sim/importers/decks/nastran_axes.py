@@ -64,10 +64,8 @@ class NastranPoints:
             raise DatasetError(f"{self.path}: there are two coordinate systems {number} ({place})")
 
     def texts(self, number: str) -> list[str]:
-        """The coordinates of a point along the basic axes, as texts; as they are written, if they stand so."""
+        """The coordinates of a point along the basic axes, as texts with all digits."""
         system, texts, place = self.grids[number]
-        if (system or self.default) in _BASIC:
-            return [text or "0." for text in texts]
         return [repr(float(x)) for x in self._moved(system or self.default, texts, place, ())]
 
     def _moved(self, system: str, texts: list[str], place: str, within: tuple[str, ...]) -> np.ndarray:

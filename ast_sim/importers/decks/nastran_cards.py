@@ -77,6 +77,7 @@ def plain_nastran(path: Path) -> bytes:
         if name.startswith("C") and name not in _ELEMENTS and not _NO_ELEMENTS.match(name):
             raise DatasetError(f"{path}: holds {name} elements, which are not read ({place}): {INSTEAD}")
         if name == "GRID":
+            fields[0] = fields[0].lstrip("0")
             before, where = places.setdefault(fields[0], (fields[1:5], place))
             if before != fields[1:5]:
                 raise DatasetError(
@@ -98,10 +99,10 @@ def plain_nastran(path: Path) -> bytes:
 def _plain_element(path: Path, place: str, name: str, fields: list[str]) -> list[str]:
     """The lines of an element: its number, its property, its nodes. Surfaces may lack nodes within their edges."""
     *_, most = _ELEMENTS[name]
-    nodes = [text for text in fields[2 : 2 + most] if text not in ("", "0")]
+    nodes = [text.lstrip("0") for text in fields[2 : 2 + most] if text.strip("0")]
     least = _ELEMENTS[name][0]
     if name in _OF_CORNERS and len(nodes) < most:
-        nodes = [text for text in fields[2 : 2 + least] if text]
+        nodes = [text.lstrip("0") for text in fields[2 : 2 + least] if text]
         name = _OF_CORNERS[name]
     if len(nodes) not in (least, most) or not all(text.isdigit() for text in nodes):
         raise DatasetError(

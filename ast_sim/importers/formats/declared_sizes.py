@@ -228,6 +228,42 @@ def stored_in_hdf(path: Path, group: str) -> int:
     return looked_at(path, total)
 
 
+def linked_files(path: Path) -> list[Path]:
+    """The files from which an HDF5 file takes arrays, by virtual arrays or external links.
+
+    Raises:
+        DatasetError: it is damaged.
+    """
+
+    def names_in(file: Any) -> set[str]:
+        names: set[str] = set()
+
+        def look(_: str, item: Any) -> None:
+            if isinstance(item, h5py.Dataset):
+                names.update(one.file_name for one in (item.virtual_sources() if item.is_virtual else ()))
+            else:
+                links = (item.get(name, getlink=True) for name in item)
+                names.update(link.filename for link in links if isinstance(link, h5py.ExternalLink))
+
+        look("/", file)
+        file.visititems(look)
+        return names - {"."}  # the file itself
+
+    return sorted(path.parent / name for name in looked_at(path, names_in))
+
+
+def require_linked_files(path: Path) -> None:
+    """Check that an HDF5 file has all `linked_files`. HDF5 takes zeros for a virtual array whose file is missing, and
+    looks for it where the process runs, too.
+
+    Raises:
+        DatasetError: one is missing, or the file is damaged.
+    """
+    missing = next((file for file in linked_files(path) if not file.is_file()), None)
+    if missing is not None:
+        raise DatasetError(f"{path}: takes numbers from {missing.name}, which is not there: copy it beside this file")
+
+
 def declared_in_vtkhdf(path: Path) -> list[list[int]]:
     """[points, cells] of each step of a VTKHDF file of an unstructured grid; empty for other types.
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import mmap
 import re
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +28,7 @@ _HEADER = re.compile(
 )
 _NO_NUMBER = re.compile(rb"^ -[12][^\n]*[*dDqQ,;][^\n]*", re.MULTILINE)  # stars: more digits than there is room for
 _MODES = {b"2": "modes of vibration", b"4": "modes of buckling"}
+_OF_A_MODE = b"    1PMODE "  # stands before the header of each result of a mode, also of modes with damping
 
 _TEXT_WIDTHS = {0: 5, 1: 10}  # of the number of a node, by format
 _BINARY_WIDTHS = {2: 4, 3: 8}  # of a value, by format
@@ -89,6 +91,7 @@ def read_frd_headers(path: Path) -> tuple[list[int], list[FrdResult]]:
             results = [_result(header, end) for header, end in headers]
             wrong = _no_number(content, results)
             cut_off = next((result for result in results if not result.is_whole(content)), None)
+            of_modes = content.find(_OF_A_MODE) >= 0
     except (OSError, ValueError) as error:
         told = " ".join(str(error).split())
         raise DatasetError(f"{path}: cannot be read as results of CalculiX: it is damaged: {told}") from error
@@ -103,14 +106,25 @@ def read_frd_headers(path: Path) -> tuple[list[int], list[FrdResult]]:
         raise DatasetError(
             f"{path}: holds {imaginary}, the displacement of a vibration at a frequency, which is no frame of a motion"
         )
-    modes = next((header["kind"].strip() for header, _ in headers if header["kind"].strip() in _MODES), None)
+    kinds = [header["kind"].strip() for header, _ in headers] + [b"2"] * of_modes
+    modes = next((_MODES[kind] for kind in kinds if kind in _MODES), None)
     if modes is not None:
         raise DatasetError(
-            f"{path}: holds {_MODES[modes]}, which are no frames of a motion: write the results of a *STATIC or"
-            " *DYNAMIC step"
+            f"{path}: holds {modes}, which are no frames of a motion: write the results of a *STATIC or *DYNAMIC step"
         )
     _require_ascending(path, results)
+    _require_once(path, results)
     return counts, results
+
+
+def _require_once(path: Path, results: list[FrdResult]) -> None:
+    """Check that no increment has a result twice for all of its nodes: of two, a reader takes the last."""
+    held = Counter((result.name, result.time, result.count) for result in results)
+    for (name, time, _), often in held.items():
+        if often > 1:
+            raise DatasetError(
+                f"{path}: holds {name} {often} times for the time {time:g}: is it put together of two files? Take one"
+            )
 
 
 def _require_ascending(path: Path, results: list[FrdResult]) -> None:

@@ -24,6 +24,7 @@ from ast_sim.importers.formats.declared_sizes import (
     declared_in_vtkhdf,
     declared_in_xml,
     needed_bytes,
+    require_linked_files,
     stored_in_hdf,
 )
 from ast_sim.importers.formats.dyna_files import require_no_deleted, require_whole, with_nodes
@@ -161,6 +162,7 @@ def _checked(path: Path) -> _Checked:
     if ending in (".pvtu", ".pvtp", ".pvts", *BLOCKS):
         return _of_pieces(path)
     if ending == ".vtkhdf" or (ending in EXODUS and is_hdf(path)):
+        require_linked_files(path)
         budget = _OWN_BYTES + _COPIES * stored_in_hdf(path, "VTKHDF" if ending == ".vtkhdf" else "/")
         return _Checked([], budget, timed=timed)
     if ending == ".frd":

@@ -100,9 +100,9 @@ def _steps(path: Path, by_field: dict[tuple[bool, str], dict[Step, list[GmshFiel
     other = next((name for name, steps in others if set(steps) != set(usual)), None)
     if other is not None:
         raise DatasetError(
-            f"{path}: the field {first!r} has {counted(len(usual), 'step')}, from the time {usual[0][0]:g} on,"
-            f" {other!r} has {len(several[other])}, from {several[other][0][0]:g} on: write all fields at the same"
-            " steps and times"
+            f"{path}: the field {first!r} has {counted(len(usual), 'step')}, from step {usual[0][1]} at the time"
+            f" {usual[0][0]:g} on, {other!r} has {len(several[other])}, from step {several[other][0][1]} at"
+            f" {several[other][0][0]:g} on: write all fields at the same steps and times"
         )
     steps = sorted(usual)
     times, numbers = (list(column) for column in zip(*steps, strict=True))

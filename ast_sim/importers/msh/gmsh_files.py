@@ -120,7 +120,9 @@ def _take(section: Section, content: _Content) -> None:
         case "NodeData" | "ElementData":
             content.data.append(_data(section))
         case "ElementNodeData":
-            content.notes.append("a field with values at the nodes of each element is left out")
+            name = _texts(section)[0]
+            note = f"the field {name!r} has values at the nodes of each element: it is left out"
+            content.notes.extend([note] if note not in content.notes else [])
             section.skip()
         case _:
             section.skip()
@@ -230,13 +232,17 @@ def _kind(number: int) -> str:
 
 
 def _data(section: Section) -> GmshField:
-    texts = [section.line().strip().strip('"') for _ in range(int(section.line()))]
+    texts = _texts(section)
     reals = [float(section.line()) for _ in range(int(section.line()))]
     facts = [int(section.line()) for _ in range(int(section.line()))]
     columns, count = facts[1], facts[2]
     numbers, values = section.records_of_data(count, columns)
-    name = texts[0] if texts else ""
-    return GmshField(section.name == "NodeData", name, facts[0], reals[0] if reals else 0.0, numbers, values)
+    return GmshField(section.name == "NodeData", texts[0], facts[0], reals[0] if reals else 0.0, numbers, values)
+
+
+def _texts(section: Section) -> list[str]:
+    """The texts of a field, of which the first is its name; "" if there is none."""
+    return [section.line().strip().strip('"') for _ in range(int(section.line()))] or [""]
 
 
 def _source(path: Path, content: _Content) -> SourceMesh:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from ast_sim.importers.formats.exodus.exodus_pieces import is_piece
 from ast_sim.importers.formats.vtk_files import BLOCKS
-from ast_sim.importers.frames_in_file import ONE_FRAME, XDMF, holds_frames
+from ast_sim.importers.frames_in_file import ONE_FRAME, XDMF, holds_frames, require_unpacked
 from ast_sim.importers.order_of_files.by_name import natural_order
 from ast_sim.importers.order_of_files.left_out import left_out
 from ast_sim.importers.order_of_files.listed import SERIES, FrameFiles, in_collection, in_series
@@ -32,6 +32,7 @@ def frame_files(source: Path) -> FrameFiles:
         return in_series(source)
     if source.suffix.lower() in ONE_FRAME or holds_frames(source) or is_piece(source):
         return FrameFiles([[source]])
+    require_unpacked(source)
     raise DatasetError(
         f"{source}: must be a .pvd or .series file, a folder of files of frames ({', '.join(ONE_FRAME)}), or one file"
         " with all frames, such as .vtkhdf, .frd, .xdmf or .exo"

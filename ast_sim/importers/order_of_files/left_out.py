@@ -6,6 +6,8 @@ import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
+from ast_sim.importers.formats.declared_sizes import linked_files
+from ast_sim.importers.formats.exodus.exodus_files import is_hdf
 from ast_sim.importers.formats.vtk_files import BLOCKS
 from ast_sim.importers.frames_in_file import ONE_FRAME, holds_frames
 from ast_sim.importers.order_of_files.by_name import natural_order
@@ -38,7 +40,8 @@ def _results_in(entry: Path) -> Iterator[Path]:
 
 
 def no_pieces(files: Iterable[Path]) -> list[Path]:
-    """The files that are whole: without pieces that another one lists, and without the second file of TetGen."""
+    """The files that are whole: without pieces that another one lists or takes arrays from, and without the second file
+    of TetGen."""
     whole = [file for file in files if file.suffix.lower() != ".ele" or not file.with_suffix(".node").is_file()]
     listed = {piece for file in whole for piece in _with_listed([file]) if piece != file.resolve()}
     return [file for file in whole if file.resolve() not in listed]
@@ -51,3 +54,5 @@ def _with_listed(files: Iterable[Path]) -> Iterator[Path]:
         if file.suffix.lower() in _LISTING and file.is_file():
             names = ((one or other).decode(errors="replace") for one, other in _LISTED.findall(file.read_bytes()))
             yield from _with_listed(file.parent / name.replace("\\", "/") for name in names)
+        if file.suffix.lower() == ".vtkhdf" and is_hdf(file):
+            yield from _with_listed(linked_files(file))

@@ -35,6 +35,7 @@ _NAMED = {
 
 # With these options of *BOUNDARY the values come from other results or from a subroutine.
 _FROM_ELSEWHERE = {"SUBMODEL", "USER"}
+_PLAIN = {"OP", "INPUT"}  # with no others the value in a line is the displacement at the end of the step
 
 # Elements in a plane, whose nodes go nowhere along z.
 _PLANE = ("CPE", "CPS", "CPEG", "CAX", "CGAX")
@@ -64,6 +65,8 @@ class Job:
         ends: the times at which the steps end.
         starts_with: what is there at rest beside a temperature, such as STRESS; see *INITIAL CONDITIONS.
         adjusting: keywords that let CalculiX move nodes onto a surface before the first increment.
+        prescribed: for each step [n, 3] the displacements that *BOUNDARY gives the points at its end; NaN where it
+            gives none.
     """
 
     mesh: SourceMesh
@@ -72,12 +75,15 @@ class Job:
     ends: tuple[float, ...]
     starts_with: tuple[str, ...] = ()
     adjusting: tuple[str, ...] = ()
+    prescribed: tuple[np.ndarray, ...] = ()
 
 
 @dataclass(eq=False)
 class _Conditions:
     """Which directions of which points [n, 6] are prescribed now, in some step, and in all; which points [n] are
-    prescribed to move or to turn, belong to a rigid body that is prescribed, or have axes of their own (*TRANSFORM)."""
+    prescribed to move or to turn, belong to a rigid body that is prescribed, or have axes of their own (*TRANSFORM).
+    `values` [n, 6] are the displacements that are prescribed now, NaN where none is or the deck does not say it;
+    `at_ends` the ones of each step so far."""
 
     now: np.ndarray
     sometimes: np.ndarray
@@ -86,11 +92,14 @@ class _Conditions:
     turned: np.ndarray
     rigid: np.ndarray
     own_axes: np.ndarray
+    values: np.ndarray
+    at_ends: list[np.ndarray] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
     def end_step(self) -> None:
         self.sometimes |= self.now
         self.always &= self.now
+        self.at_ends.append(np.where(self.own_axes[:, None] | ~self.now[:, :3], np.nan, self.values[:, :3]))
 
 
 def read_job(path: Path) -> Job:
@@ -119,7 +128,9 @@ def read_job(path: Path) -> Job:
         mesh.notes.append(
             "nodes move at the start (*INITIAL CONDITIONS): in the frame at rest they stand where they are"
         )
-    return Job(mesh, _node_type(mesh, conditions), materials, _ends(deck), tuple(starts_with), _adjusting(deck))
+    types = _node_type(mesh, conditions)
+    prescribed = tuple(conditions.at_ends)
+    return Job(mesh, types, materials, _ends(deck), tuple(starts_with), _adjusting(deck), prescribed)
 
 
 def _adjusting(deck: Deck) -> tuple[str, ...]:
@@ -156,7 +167,8 @@ def _conditions(deck: Deck, mesh: SourceMesh) -> _Conditions:
     shape = (len(mesh.points), _DIRECTIONS)
     free = np.zeros(shape, bool)
     moved, turned, rigid, own_axes = (free[:, 0].copy() for _ in range(4))
-    state = _Conditions(free.copy(), free.copy(), np.ones(shape, bool), moved, turned, rigid, own_axes)
+    values = np.full(shape, np.nan)
+    state = _Conditions(free.copy(), free.copy(), np.ones(shape, bool), moved, turned, rigid, own_axes, values)
     renewed = False
     for keyword in deck.keywords:
         if keyword.name == "BOUNDARY":
@@ -189,7 +201,9 @@ def _prescribe(keyword: Keyword, line: Line, state: _Conditions, mesh: SourceMes
     target, first, last, value = [*tokens(line), "", "", "", ""][:4]
     rows = rows_of_target(keyword, target, mesh)
     if first.upper() in _NAMED:
-        state.now[np.ix_(rows, np.array(_NAMED[first.upper()]) - 1)] = True
+        held = np.ix_(rows, np.array(_NAMED[first.upper()]) - 1)
+        state.now[held] = True
+        state.values[held] = 0
         return
     lowest = whole(first, line)
     highest = whole(last, line) if last else lowest
@@ -197,6 +211,7 @@ def _prescribe(keyword: Keyword, line: Line, state: _Conditions, mesh: SourceMes
         raise DatasetError(f"{line.place}: holds the directions {lowest} to {highest}; the first is 1")
     for direction in range(lowest, min(highest, _DIRECTIONS) + 1):
         state.now[rows, direction - 1] = True
+        state.values[rows, direction - 1] = real(value, line) if keyword.options.keys() <= _PLAIN else np.nan
     if real(value, line) != 0 or keyword.options.keys() & _FROM_ELSEWHERE:
         state.moved[rows] |= lowest <= 3
         state.turned[rows] |= 3 < lowest <= _DIRECTIONS

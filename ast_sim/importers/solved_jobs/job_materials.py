@@ -8,7 +8,7 @@ import numpy as np
 
 from ast_sim.importers.decks.deck_numbers import real, refuse_decimal_commas, tokens
 from ast_sim.importers.decks.deck_parts import Deck
-from ast_sim.importers.decks.keyword_lines import Keyword, Line
+from ast_sim.importers.decks.keyword_lines import Keyword, Line, known_key
 from ast_sim.importers.formats.source_mesh import SourceMesh
 from ast_sim.importers.solved_jobs.job_temperatures import node_temperatures
 from ast_sim.material import ELASTIC, YIELD_STRESS
@@ -146,7 +146,8 @@ def material_columns(deck: Deck, mesh: SourceMesh) -> tuple[dict[str, list[np.nd
 
 def _of_section(keyword: Keyword, deck: Deck, materials: dict[str, _Material]) -> tuple[_Material, np.ndarray]:
     """The material of a section, and the numbers of its elements."""
-    name, elements = keyword.required("MATERIAL").upper(), keyword.required("ELSET").upper()
+    name = known_key(keyword.required("MATERIAL"), materials)
+    elements = known_key(keyword.required("ELSET"), deck.root.element_sets)
     if name not in materials:
         raise keyword.error(f"there is no material {keyword.options['MATERIAL']!r}")
     if elements not in deck.root.element_sets:
@@ -168,7 +169,7 @@ def _materials(deck: Deck) -> tuple[dict[str, _Material], list[str]]:
             current = materials[name.upper()] = _Material(name)
         elif keyword.name == "CHANGEMATERIAL":
             name = keyword.required("NAME")
-            current = materials.get(name.upper(), _Material(name))
+            current = materials.get(known_key(name, materials), _Material(name))
         elif keyword.name in ("ELASTIC", "PLASTIC") or keyword.name in _OTHER_LAWS:
             other = _not_understood(keyword)
             current.other_law |= bool(other)

@@ -11,6 +11,7 @@ import numpy as np
 from ast_sim.importers.formats.source_mesh import SourceMesh
 from ast_sim.importers.formats.vtk_files import vtk_frames
 from ast_sim.importers.solved_jobs.job import Job
+from ast_sim.importers.solved_jobs.job_motion import require_as_prescribed
 from ast_sim.importers.stress import order_of, von_mises
 from ast_sim.material import PRESSURES
 from ast_sim.mesh_arrays import deforms
@@ -43,8 +44,8 @@ def job_frames(job: Job, results: Path, pascals: float, wanted: Sequence[str] = 
         wanted: further fields at the nodes, by their names in the deck (PEEQ, RF) or in the results (PE, FORC).
 
     Raises:
-        DatasetError: the results belong to another deck, hold no displacement or not a wanted field, or start after
-            the rest with a temperature, which is not known at rest.
+        DatasetError: the results belong to another deck, hold nodes elsewhere than *BOUNDARY puts them, no displacement
+            or not a wanted field, or start after the rest with a temperature, which is not known at rest.
     """
     materials = {
         name: [values * (pascals if name in PRESSURES else 1.0) for values in parts]
@@ -65,6 +66,7 @@ def job_frames(job: Job, results: Path, pascals: float, wanted: Sequence[str] = 
             mesh.notes.append("a frame at rest stands before the results")
             yield replace(mesh, point_fields=rest, time=0.0)
         last = frame.time
+        require_as_prescribed(job, results, frame.time or 0.0, fields["displacement"])
         yield replace(mesh, point_fields=fields, time=frame.time)
     if last is not None and job.ends and last < job.ends[-1] * (1 - 1e-6):
         warn(

@@ -6,7 +6,7 @@ import numpy as np
 
 from ast_sim.importers.decks.deck_numbers import real, refuse_decimal_commas, tokens
 from ast_sim.importers.decks.deck_parts import Deck
-from ast_sim.importers.decks.keyword_lines import Keyword
+from ast_sim.importers.decks.keyword_lines import Keyword, known_key
 from ast_sim.importers.formats.source_mesh import SourceMesh
 
 # In steps of these the temperatures are computed.
@@ -25,11 +25,11 @@ def rows_of_target(keyword: Keyword, target: str, mesh: SourceMesh) -> np.ndarra
     if target.isdigit():
         assert mesh.same_point is not None
         return np.flatnonzero(mesh.same_point == int(target))
-    name = target.upper()
-    nodes = next((nodes for key, nodes in mesh.groups.items() if key.upper() == name), None)
-    if nodes is None:
+    groups = {name.upper(): nodes for name, nodes in mesh.groups.items()}
+    key = known_key(target, groups)
+    if key not in groups:
         raise keyword.error(f"there is no set of nodes {target!r}")
-    return nodes
+    return groups[key]
 
 
 def node_temperatures(deck: Deck, mesh: SourceMesh) -> np.ndarray:
@@ -49,7 +49,7 @@ def node_temperatures(deck: Deck, mesh: SourceMesh) -> np.ndarray:
         for line in keyword.data:
             refuse_decimal_commas(line, 2, "a target and a temperature")
             target, value = [*tokens(line), "", ""][:2]
-            rows = rows_of_target(keyword, target.strip('"'), mesh)
+            rows = rows_of_target(keyword, target, mesh)
             given = first if initial else later
             given[rows] = real(value, line)
             if not initial:

@@ -15,13 +15,16 @@ import numpy as np
 from ast_sim.importers.formats.source_mesh import SourceMesh, from_meshio
 from ast_sim.importers.meshio_files import by_meshio, what_meshio_says
 from ast_sim.importers.xdmf.xdmf_grids import with_one_grid, with_one_series
-from ast_sim.importers.xdmf.xdmf_items import made_of_others, with_joined_points, write_out
+from ast_sim.importers.xdmf.xdmf_items import made_of_others, require_linked, with_joined_points, write_out
 from ast_sim.importers.xdmf.xdmf_spellings import (
     with_defaults,
     with_fields_of_one_step,
+    with_known_words,
     with_own_times,
     with_references,
+    with_series_of_version_3,
     with_version,
+    without_fields_of_grids,
     without_time,
 )
 from ast_sim.support.errors import DatasetError, counted
@@ -39,9 +42,11 @@ def xdmf_frames(path: Path) -> Iterator[SourceMesh]:
         tree = ET.parse(path)
     except (ET.ParseError, OSError, ValueError, LookupError) as error:
         raise DatasetError(f"{path}: cannot be read as a mesh: it is no XML: {error}") from error
-    several = with_version(tree) | with_own_times(path, tree) | with_fields_of_one_step(tree)
-    several |= with_one_series(tree)
+    several = with_known_words(tree) | with_version(tree) | with_series_of_version_3(tree)
+    several |= with_own_times(path, tree) | with_fields_of_one_step(tree) | with_one_series(tree)
+    told = without_fields_of_grids(tree)
     _require_understood(path, tree)
+    require_linked(path, tree)
     series = tree.findall("Domain/Grid[@GridType='Collection']")
     version = str(tree.getroot().get("Version"))
     if series and version.partition(".")[0] != "3":
@@ -50,8 +55,8 @@ def xdmf_frames(path: Path) -> Iterator[SourceMesh]:
             " .pvd"
         )
     named = ", ".join(dict.fromkeys(one.get("Name", "without a name") for one in tree.iter("Set")))
-    told = [f"sets are not read: {named}"] if named else []
-    several |= not series and len(tree.findall("Domain/Grid")) > 1
+    several |= bool(told) or (not series and len(tree.findall("Domain/Grid")) > 1)
+    told += [f"sets are not read: {named}"] if named else []
     told += [] if series else with_one_grid(path, tree)
     time, timed = (None, False) if series else without_time(path, tree)
     if series:

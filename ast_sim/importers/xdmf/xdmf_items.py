@@ -17,6 +17,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from ast_sim.importers.formats.declared_sizes import require_linked_files
 from ast_sim.support.errors import DatasetError, counted
 
 _JOIN = re.compile(r"\s*JOIN\s*\(\s*(\$\d+(?:\s*[,;]\s*\$\d+)*)\s*\)\s*", re.IGNORECASE)
@@ -34,6 +35,15 @@ def _kind(item: ET.Element) -> str:
 def made_of_others(tree: ET.ElementTree[Any]) -> bool:
     """Whether numbers of a file are made of other numbers."""
     return any(_kind(item) != "UNIFORM" for item in tree.iter("DataItem"))
+
+
+def require_linked(path: Path, tree: ET.ElementTree[Any]) -> None:
+    """Check that the HDF5 files of a file have all files from which they take arrays; see `require_linked_files`."""
+    items = [item for item in tree.iter("DataItem") if item.get("Format") == "HDF"]
+    names = {(item.text or "").strip().rpartition(":")[0] for item in items}
+    for file in sorted(path.parent / name for name in names):
+        if file.is_file():
+            require_linked_files(file)
 
 
 def with_joined_points(tree: ET.ElementTree[Any]) -> bool:

@@ -10,6 +10,14 @@ from typing import Any
 
 from ast_sim.support.errors import DatasetError
 
+# The words of XDMF that meshio knows in one spelling; XDMF itself takes capital and small letters alike.
+_WORDS = {
+    "Attribute": {"Center": ("Node", "Cell", "Grid")},
+    "Grid": {"GridType": ("Uniform", "Collection", "Tree"), "CollectionType": ("Temporal", "Spatial")},
+    "DataItem": {"NumberType": ("Float", "Int", "UInt", "Char", "UChar"), "Format": ("XML", "HDF", "Binary")},
+    "Geometry": dict.fromkeys(("GeometryType", "Type"), ("XYZ", "XY", "X_Y_Z", "X_Y")),
+}
+
 
 def with_version(tree: ET.ElementTree[Any]) -> bool:
     """Take a file that does not say its version for version 3. Whether it is so."""
@@ -17,6 +25,45 @@ def with_version(tree: ET.ElementTree[Any]) -> bool:
     if silent:
         tree.getroot().set("Version", "3.0")
     return silent
+
+
+def with_series_of_version_3(tree: ET.ElementTree[Any]) -> bool:
+    """Take a series of version 2 for one of version 3, of which meshio reads series; their grids are written alike.
+    Whether it is so."""
+    is_series = tree.find("Domain/Grid[@GridType='Collection']") is not None
+    old = is_series and str(tree.getroot().get("Version")).startswith("2.")
+    if old:
+        tree.getroot().set("Version", "3.0")
+    return old
+
+
+def with_known_words(tree: ET.ElementTree[Any]) -> bool:
+    """Write words as meshio knows them, where their letters are capital or small ones instead, and leave out remarks
+    (Information). Whether there is one of either."""
+    from meshio.xdmf.common import xdmf_to_meshio_type
+
+    cells = dict.fromkeys(("TopologyType", "Type"), (*xdmf_to_meshio_type, "Mixed"))
+    changed = False
+    for parent in list(tree.iter()):
+        for remark in parent.findall("Information"):
+            parent.remove(remark)
+            changed = True
+        for key, words in {**_WORDS, "Topology": cells}.get(parent.tag, {}).items():
+            said = parent.get(key, "")
+            word = next((one for one in words if one.casefold() == said.strip().casefold()), said)
+            if word != said:
+                parent.set(key, word)
+                changed = True
+    return changed
+
+
+def without_fields_of_grids(tree: ET.ElementTree[Any]) -> list[str]:
+    """Leave out fields with one value for a whole grid. A note on them."""
+    fields = [(grid, one) for grid in tree.iter("Grid") for one in grid.findall("Attribute[@Center='Grid']")]
+    for grid, one in fields:
+        grid.remove(one)
+    names = dict.fromkeys(repr(one.get("Name", "without a name")) for _, one in fields)
+    return [f"fields with one value for the whole grid are left out: {', '.join(names)}"] if names else []
 
 
 def with_own_times(path: Path, tree: ET.ElementTree[Any]) -> bool:
