@@ -56,6 +56,7 @@ def main(argv: list[str] | None = None) -> int:
         sys.stdout.flush()
         return 0
     except KeyboardInterrupt as error:
+        _flush()
         return 128 + (error.number if isinstance(error, Interrupted) else signal.SIGINT)
     except (BrokenPipeError, SystemExit) as error:
         unwritten = _flush()
