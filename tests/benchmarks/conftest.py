@@ -8,6 +8,7 @@ import pytest
 import torch
 from checks import made_once
 
+from ast_sim.inference import effort
 from benchmarks.studies import coverage, jumps, shipped
 
 
@@ -18,6 +19,17 @@ def one_thread(monkeypatch):
     threads = torch.get_num_threads()
     yield
     torch.set_num_threads(threads)
+
+
+def choose_among_few_efforts(patch: pytest.MonkeyPatch) -> None:
+    """By one call, Newton steps, the solver where they move far, and the solver: four in place of eight."""
+    patch.setattr(effort, "CHOSEN_STEPS", (0, effort.MOST_NEWTON_STEPS))
+    patch.setattr(effort, "CHOSEN_MOVES", effort.CHOSEN_MOVES[:1])
+
+
+@pytest.fixture
+def few_efforts(monkeypatch):
+    choose_among_few_efforts(monkeypatch)
 
 
 @pytest.fixture(scope="session")
@@ -36,6 +48,7 @@ def shipped_plates(tmp_path_factory) -> Path:
             patch.setitem(jumps.ROWS, "plates400_long", row)
             patch.setitem(coverage.ROWS, "plates", scenes)
             patch.setattr(shipped, "SHIPPED", folder)
+            choose_among_few_efforts(patch)
             with contextlib.redirect_stdout(told):
                 shipped.main(["plates", "--folder", str(folder / "data")])
 

@@ -16,7 +16,7 @@ FRESH = 3
 
 
 @pytest.fixture
-def small(monkeypatch, tmp_path, one_thread, shipped_plates):
+def small(monkeypatch, tmp_path, one_thread, few_efforts, shipped_plates):
     """A row of plates whose run had four steps; scenes and run as the shipped run has them, before it was calibrated;
     results in a folder apart."""
     shutil.copytree(shipped_plates / "data", tmp_path / "data")
