@@ -22,18 +22,20 @@ demo: $(VENV)/installed
 
 # The op tests run once more on each instruction set that is supported but was not chosen, except those that run on all by themselves, and
 # those that no kernel has a part in: how ops are registered (opcheck) and differentiated, how the library is found and told of threads, and
-# which arguments it takes (what odd values do to a kernel of any set the fuzz targets try).
-OTHER_SETS = from ast_sim.ops.library import configuration as c; print(*(i for i in c()["supported"] if i != c()["instruction_set"]))
+# which arguments it takes (what odd values do to a kernel of any set the fuzz targets try). Each set has a process, gw0, gw1 and so on, which
+# runs all of them.
+OTHER_SETS = from ast_sim.ops.library import configuration as c; \
+	print(*(f"--tx=popen//env:AST_SIM_ISA={i}" for i in c()["supported"] if i != c()["instruction_set"]))
 
 # Side by side, of a file in any order; more than four processes could want more memory than there is.
 PYTEST := $(BIN)/python -m pytest --numprocesses=auto --maxprocesses=4 --dist=worksteal
 
 test: $(VENV)/tested
 	$(PYTEST)
-	@set -e; for isa in $$($(BIN)/python -c '$(OTHER_SETS)'); do \
-	  echo "AST_SIM_ISA=$$isa"; AST_SIM_ISA=$$isa $(PYTEST) tests/ops -k "not every_instruction_set and not opcheck" \
+	@set -e; sets="$$($(BIN)/python -c '$(OTHER_SETS)')"; if [ -n "$$sets" ]; then \
+	  echo "$$sets"; $(BIN)/python -m pytest $$sets --dist=each tests/ops -k "not every_instruction_set and not opcheck" \
 	      $(patsubst %,--ignore=tests/ops/test_%.py,library derivatives binding_arguments trusted_indices spec); \
-	done
+	fi
 
 bench: $(VENV)/benched
 	$(BIN)/python -m benchmarks.kernels --json benchmarks/results/kernels.json

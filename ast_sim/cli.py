@@ -6,7 +6,6 @@ An error that a user can act on is printed as one line on stderr, and the exit c
 from __future__ import annotations
 
 import argparse
-import contextlib
 import io
 import os
 import shlex
@@ -15,6 +14,7 @@ import sys
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+from typing import TextIO
 
 from ast_sim import __version__
 from ast_sim.command_line import commands, help_lines, judging_commands, planning_commands
@@ -56,6 +56,7 @@ def main(argv: list[str] | None = None) -> int:
         sys.stdout.flush()
         return 0
     except KeyboardInterrupt as error:
+        _flush()
         return 128 + (error.number if isinstance(error, Interrupted) else signal.SIGINT)
     except (BrokenPipeError, SystemExit) as error:
         unwritten = _flush()
@@ -77,10 +78,14 @@ def _flush() -> OSError | None:
     try:
         sys.stdout.flush()
     except OSError as error:
-        # Redirect it, so that Python's flush at exit does not fail, too.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _silence(sys.stdout)
         return error
     return None
+
+
+def _silence(stream: TextIO) -> None:
+    """Redirect a stream that cannot be written, so that Python's flush at exit does not fail, too."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def _show(message: object, category: type[Warning]) -> None:
@@ -92,8 +97,10 @@ def _show(message: object, category: type[Warning]) -> None:
 
 
 def _tell(what: str, message: object) -> None:
-    with contextlib.suppress(OSError):  # nobody can be told that a line on stderr was not written
-        print(f"{what}: {printable(' '.join(str(message).split()))}", file=sys.stderr)
+    try:
+        print(f"{what}: {printable(' '.join(str(message).split()))}", file=sys.stderr, flush=True)
+    except OSError:  # nobody can be told that a line on stderr was not written
+        _silence(sys.stderr)
 
 
 def build_parser() -> Parser:

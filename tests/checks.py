@@ -1,7 +1,6 @@
 """Checks that the tests of all ops share: the accuracy rule, equality over threads and instruction sets."""
 
 import fcntl
-import functools
 import os
 import shutil
 import subprocess
@@ -10,6 +9,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import forked
 import numpy as np
 import pytest
 import torch
@@ -117,50 +117,12 @@ def made_once(tmp_path_factory: pytest.TempPathFactory, name: str, make: Callabl
     return folder
 
 
-SERVER = """
-import os, sys, traceback
-import torch, pytest, hypothesis
-import ast_sim, ast_sim.ops
-for line in sys.stdin:
-    child = os.fork()
-    if not child:
-        status = 1
-        try:
-            exec(compile(eval(line), "<code>", "exec"), {"__name__": "__main__"})
-            status = 0
-        except BaseException:
-            traceback.print_exc(file=sys.stdout)
-        finally:
-            sys.stdout.flush()
-            os._exit(status)
-    print(f"END {os.waitpid(child, 0)[1]}", flush=True)
-"""
-
-
-@functools.cache
-def _server(**environment: str) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [sys.executable, "-c", SERVER],
-        env=os.environ | environment,
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-
-
 def run_forked(code: str, **environment: str) -> str:
     """As run_python, in a copy of a process that has torch and the ops imported: all but a moment of a short test."""
-    server = _server(**environment)
-    assert server.stdin and server.stdout
-    server.stdin.write(repr(code) + "\n")
-    server.stdin.flush()
-    shown = []
-    for line in server.stdout:
-        if line.startswith("END "):
-            assert line == "END 0\n", f"{line}{''.join(shown)}"
-            return "".join(shown)
-        shown.append(line)
-    raise AssertionError(f"the process ended with {server.wait()}: {''.join(shown)}")
+    end = "import os, sys; sys.stdout.flush(); os._exit(0)"  # to take Python down would take longer than a short test
+    result = forked.run(["-c", f"{code}\n{end}"], env=os.environ | environment, imported=forked.OPS)
+    assert result.returncode == 0, result.stderr
+    return result.stdout
 
 
 def assert_same_everywhere(code: str) -> None:

@@ -14,6 +14,7 @@ from ast_sim.demo import FULL, KEPT, QUICK, Size, headlines
 from ast_sim.figures import Beside
 
 TINY = Size(train=1, valid=1, test=1, steps=4)
+NODES = 100
 FILES = (
     "first.png",
     "report.html",
@@ -26,12 +27,18 @@ FILES = (
 )
 
 
+def make_tiny(patch: pytest.MonkeyPatch, size: Size = TINY) -> None:
+    """Few steps on small plates."""
+    patch.setattr(demo, "QUICK", size)
+    patch.setattr(demo, "NODES", NODES)
+
+
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     """The folder of a demonstration."""
     folder = tmp_path_factory.mktemp("demo") / "demo"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(demo, "QUICK", TINY)
+        make_tiny(patch)
         assert main(["demo", "--quick", "--out", str(folder)]) == 0
     return folder
 
@@ -63,7 +70,7 @@ def test_everything_is_made(made):
 
 
 def test_again_in_the_same_folder_reuses_the_parts_and_other_settings_are_refused(made, monkeypatch, capsys):
-    monkeypatch.setattr(demo, "QUICK", TINY)
+    make_tiny(monkeypatch)
     before = figures(made)
     weights = (made / "run" / "checkpoints" / "step-4" / "manifest.json").read_bytes()
     assert main(["demo", "--quick", "--out", str(made)]) == 0
@@ -76,13 +83,13 @@ def test_again_in_the_same_folder_reuses_the_parts_and_other_settings_are_refuse
     assert (made / "run" / "checkpoints" / "step-4" / "manifest.json").read_bytes() == weights
     assert main(["demo", "--quick", "--out", str(made), "--seed", "1"]) == 2
     assert "first.h5 exists and holds other data" in capsys.readouterr().err
-    monkeypatch.setattr(demo, "QUICK", Size(train=1, valid=1, test=1, steps=5))
+    make_tiny(monkeypatch, replace(TINY, steps=5))
     assert main(["demo", "--quick", "--out", str(made)]) == 2
     assert "train.steps = 4, not 5" in capsys.readouterr().err
 
 
 def test_the_same_seed_gives_the_same_numbers_elsewhere(made, tmp_path, monkeypatch):
-    monkeypatch.setattr(demo, "QUICK", TINY)
+    make_tiny(monkeypatch)
     (tmp_path / "again").mkdir()
     for name in ("data.h5", "unseen.h5"):  # that scenes are the same again is tested with the solver
         shutil.copy(made / name, tmp_path / "again")

@@ -11,6 +11,7 @@ from itertools import compress
 import torch
 from torch import Tensor, nn
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
+from torch.optim.adamw import adamw
 
 from ast_sim.runs.train_config import OptimizerName
 from ast_sim.training.muon import Muon
@@ -39,7 +40,7 @@ class Optimizer:
         rest = sum(p.numel() for p in others)
         self._rest = nn.Parameter(values[:rest])
         self._rest.grad = self.gradient[:rest]
-        self._adam = torch.optim.AdamW([self._rest], lr=0.0, weight_decay=0.0, fused=True)
+        self._moments: dict[str, Tensor] = {}
         self._muon = None
         if matrices:
             self._muon = Muon(values[rest:], self.gradient[rest:], [p.shape for p in matrices])
@@ -56,14 +57,22 @@ class Optimizer:
 
     def step(self, rate: float) -> None:
         """Move the parameters against the gradient with this learning rate."""
-        self._adam.param_groups[0]["lr"] = rate
-        self._adam.step()
+        if not self._moments:
+            zeros = {name: torch.zeros_like(self._rest.detach()) for name in ("exp_avg", "exp_avg_sq")}
+            self._moments = {"step": torch.zeros((), device=self._rest.device), **zeros}
+        # The class AdamW would import the compiler of torch and SymPy: two seconds of the processor for each training.
+        with torch.no_grad():
+            adamw(
+                [self._rest], [self.gradient[: self._rest.numel()]], [self._moments["exp_avg"]],
+                [self._moments["exp_avg_sq"]], [], [self._moments["step"]], fused=True, amsgrad=False,
+                beta1=0.9, beta2=0.999, lr=rate, weight_decay=0.0, eps=1e-8, maximize=False,
+            )  # fmt: skip
         if self._muon is not None:
             self._muon.step(rate)
 
     def state(self) -> dict[str, Tensor]:
         """The moments and the number of steps, which a checkpoint keeps beside the parameters; empty before a step."""
-        state = dict(self._adam.state[self._rest])
+        state = dict(self._moments)
         return {**state, "momentum": self._muon.momentum} if state and self._muon is not None else state
 
     def restore(self, state: dict[str, Tensor]) -> None:
@@ -71,7 +80,7 @@ class Optimizer:
         state = dict(state)
         if self._muon is not None and state:
             self._muon.momentum.copy_(state.pop("momentum"))
-        self._adam.state[self._rest] = state
+        self._moments = state
 
 
 def _in_one_array(parameters: list[nn.Parameter]) -> tuple[Tensor, Tensor]:

@@ -1,6 +1,7 @@
 """The study of bands and wanted errors, from end to end on plates of 100 nodes."""
 
 import json
+import shutil
 import warnings
 from dataclasses import replace
 
@@ -8,22 +9,25 @@ import numpy as np
 import pytest
 
 import ast_sim
+from ast_sim.runs.folder import RunFolder
 from benchmarks.studies import coverage
 
 FRESH = 3
 
 
 @pytest.fixture
-def small(monkeypatch, tmp_path, one_thread):
-    """A row of plates whose run had four steps; results in a folder apart."""
-    plates = {"family": "deforming_plate", "nodes": 100, "frames": 3}
+def small(monkeypatch, tmp_path, one_thread, few_efforts, shipped_plates):
+    """A row of plates whose run had four steps; scenes and run as the shipped run has them, before it was calibrated;
+    results in a folder apart."""
+    shutil.copytree(shipped_plates / "data", tmp_path / "data")
 
     def trained(folder):
-        data = ast_sim.generate(out=folder / "small.h5", train=30, valid=1, test=1, **plates).path
-        settings = {"corrections": 0, "batch_size": 2, "statistics_pairs": 4}
-        return ast_sim.train(data, folder / "run", steps=4, resume=True, **settings)
+        run = RunFolder(folder / "run_plates400_long")
+        run.mark_best(run.metrics.best())
+        return ast_sim.Run(run.path)
 
-    row = replace(coverage.ROWS["plates"], run=trained, generate=plates, fresh=FRESH, calibration=30)
+    plates = {"family": "deforming_plate", "nodes": 100, "frames": 3}
+    row = replace(coverage.ROWS["plates"], run=trained, generate=plates, fresh=FRESH, calibration=24)
     monkeypatch.setitem(coverage.ROWS, "plates", row)
     monkeypatch.setattr(coverage, "RESULTS", tmp_path / "coverage.json")
     monkeypatch.setattr(coverage, "PAGE", tmp_path / "coverage.md")
@@ -35,7 +39,7 @@ def test_a_run_is_calibrated_and_asked_for_fresh_and_strange_scenes(small):
     result = json.loads(coverage.RESULTS.read_text())["plates"]
     row = result["rows"][0]
     assert (row["effort"], row["quantity"]) == ("0 corrections", "displacement")
-    run = ast_sim.Run(small / "data" / "run")
+    run = ast_sim.Run(small / "data" / "run_plates400_long")
     with ast_sim.Dataset(small / "data" / "plates_fresh.h5") as data, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         truths = [data["test"][index] for index in range(FRESH)]

@@ -1,14 +1,15 @@
 """docs/how-to/new-model.md, followed: its package is installed, and its commands train, evaluate and report."""
 
 import json
-import os
 import re
 import shlex
 import subprocess
 import sys
 import tomllib
+from collections.abc import Sequence
 from pathlib import Path
 
+import forked
 import pytest
 import toy
 
@@ -24,12 +25,9 @@ def blocks(language: str) -> list[str]:
     return re.findall(rf"```{language}\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
 
 
-def run(*words: str, folder: Path, packages: Path | None = None) -> subprocess.CompletedProcess:
-    """`python -m` in a process of its own, which finds what is installed in `packages`."""
-    path = os.pathsep.join(filter(None, [str(packages or ""), os.environ.get("PYTHONPATH")]))
-    command = [sys.executable, "-m", *words]
-    environment = {**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
-    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
+def run(*words: str, folder: Path, packages: Sequence[Path] = ()) -> subprocess.CompletedProcess[str]:
+    """`ast-sim` in a process of its own, which finds what is installed in `packages`."""
+    return forked.run(["-m", "ast_sim.cli", *words], cwd=folder, path=packages)
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +39,8 @@ def installed(tmp_path_factory):
     (source / "local_model.py").write_text("\n\n".join(blocks("python")), encoding="utf-8")
     (source / "pyproject.toml").write_text("\n".join(blocks("toml")), encoding="utf-8")
     offline = ["--no-index", "--no-deps", "--no-build-isolation", "--target", str(folder / "packages")]
-    done = run("pip", "install", "--quiet", *offline, str(source), folder=folder)
+    words = [sys.executable, "-m", "pip", "install", "--quiet", *offline, str(source)]
+    done = subprocess.run(words, cwd=folder, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return folder / "packages"
 
@@ -53,7 +52,7 @@ def test_the_page_leads_to_a_model(installed, tmp_path):
     more = {"train": [word for setting in FEW for word in ("--set", setting)], "evaluate": ["--out", "errors.json"]}
     for command in commands:
         words = shlex.split(command)[1:]
-        done = run("ast_sim.cli", *words, *more.get(words[0], []), folder=tmp_path, packages=installed)
+        done = run(*words, *more.get(words[0], []), folder=tmp_path, packages=[installed])
         assert done.returncode == 0, done.stderr
     losses = [line["loss"] for line in Metrics(tmp_path / "run") if "loss" in line]
     assert losses[-1] < 0.8 * losses[0], losses
@@ -65,13 +64,13 @@ def test_the_page_leads_to_a_model(installed, tmp_path):
     assert found["failures"] == 0 and model < still
     assert "local" in (tmp_path / "run.html").read_text(encoding="utf-8")
     # A run names its model, not code: without the package it cannot be opened.
-    done = run("ast_sim.cli", "evaluate", "run", "plates.h5", folder=tmp_path)
+    done = run("evaluate", "run", "plates.h5", folder=tmp_path)
     assert done.returncode == 2 and "there is no model 'local'; there are: " in done.stderr
 
 
 def test_its_settings_are_known(installed, tmp_path):
-    shown = run("ast_sim.cli", "train", "--help", folder=tmp_path, packages=installed).stdout
+    shown = run("train", "--help", folder=tmp_path, packages=[installed]).stdout
     assert "\nlocal, presets tiny:\n" in shown and "model.width=64  (an integer)\n        hidden width" in shown
     words = ["train", "plates.h5", "--out", "run", "--model", "local", "--set", "model.widht=3"]
-    done = run("ast_sim.cli", *words, folder=tmp_path, packages=installed)
+    done = run(*words, folder=tmp_path, packages=[installed])
     assert done.returncode == 2 and "no setting model.widht; the nearest is model.width" in done.stderr

@@ -4,10 +4,9 @@ import csv
 import os
 import re
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
+import forked
 import pytest
 from docs.test_pages import FOLLOWED, ROOT, blocks, calls_of, page_name, with_blocks
 
@@ -39,7 +38,7 @@ def walk(tmp_path_factory) -> tuple[Path, str]:
         assert long in program, long
         program = program.replace(long, short)
     (folder / "page.py").write_text(program)
-    done = subprocess.run([sys.executable, "page.py"], cwd=folder, capture_output=True, text=True, timeout=500)
+    done = forked.run(["page.py"], cwd=folder)
     assert done.returncode == 0, done.stderr
     return folder, done.stdout
 

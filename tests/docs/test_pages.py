@@ -10,12 +10,11 @@ import itertools
 import re
 import shlex
 import shutil
-import subprocess
-import sys
 import textwrap
 from dataclasses import dataclass
 from pathlib import Path
 
+import forked
 import pytest
 
 from ast_sim.cli import build_parser, main
@@ -104,7 +103,7 @@ def test_python_on_a_page_runs(page, tmp_path, request):
         shutil.copytree(request.getfixturevalue("made"), tmp_path, dirs_exist_ok=True)
     script = tmp_path / "page.py"
     script.write_text(program(found), encoding="utf-8")
-    done = subprocess.run([sys.executable, script.name], cwd=tmp_path, capture_output=True, text=True, timeout=240)
+    done = forked.run([script.name], cwd=tmp_path)
     assert done.returncode == 0, f"{page_name(page)}, whose lines these are:\n{done.stderr}"
 
 

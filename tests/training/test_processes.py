@@ -9,6 +9,7 @@ import sys
 import time
 from pathlib import Path
 
+import forked
 import pytest
 import torch
 import toy
@@ -30,9 +31,12 @@ SETTINGS = [
 ]  # fmt: skip
 
 
-def command(processes: int, *words: str) -> list[str]:
-    start = ["-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={processes}"] if processes > 1 else []
-    return [sys.executable, *start, "-m", "ast_sim.cli", "train", *words]
+TRAIN = ("-m", "ast_sim.cli", "train")
+
+
+def under_torchrun(*words: str) -> list[str]:
+    start = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
+    return [sys.executable, *start, *TRAIN, *words]
 
 
 def words_of(data: Path, run: Path, steps: int, *words: str) -> tuple[str, ...]:
@@ -41,8 +45,9 @@ def words_of(data: Path, run: Path, steps: int, *words: str) -> tuple[str, ...]:
 
 
 def train_two(data: Path, run: Path, steps: int, *words: str, check: bool = True):
-    words = words_of(data, run, steps, "--processes", "2", *words)
-    return subprocess.run(command(1, *words), capture_output=True, text=True, check=check, timeout=300)
+    done = forked.run([*TRAIN, *words_of(data, run, steps, "--processes", "2", *words)])
+    assert not check or done.returncode == 0, done.stderr
+    return done
 
 
 def weights(run: Path) -> dict[str, torch.Tensor]:
@@ -81,13 +86,14 @@ def test_two_processes_do_what_one_does(data, tmp_path, along):
 
     # Two that were interrupted end in the same bits: a run that goes on keeps its number of processes.
     shutil.rmtree(tmp_path / "two/checkpoints/step-8")
-    subprocess.run(command(1, "--out", str(tmp_path / "two"), "--resume"), check=True, timeout=300)
+    done = forked.run([*TRAIN, "--out", tmp_path / "two", "--resume"])
+    assert done.returncode == 0, done.stderr
     assert all(torch.equal(value, two[name]) for name, value in weights(tmp_path / "two").items())
 
 
 def test_torchrun_and_a_notebook_train_the_same_model(data, tmp_path, request, capsys):
     one_thread = {**os.environ, "OMP_NUM_THREADS": "1"}  # of each process: sums over threads round otherwise
-    subprocess.run(command(2, *words_of(data, tmp_path / "torchrun", 8)), check=True, timeout=300, env=one_thread)
+    subprocess.run(under_torchrun(*words_of(data, tmp_path / "torchrun", 8)), check=True, timeout=300, env=one_thread)
     settings = dict(setting.split("=") for setting in SETTINGS)
     given = {key.removeprefix("train."): float(value) for key, value in settings.items() if key.startswith("train.")}
     given |= {key: int(given[key]) for key in ("batch_size", "statistics_pairs", "log_every", "validate_every")}
@@ -139,7 +145,7 @@ def test_the_usual_number_follows_from_the_size_of_a_step(data, monkeypatch):
 
 def test_a_process_that_is_killed_ends_the_training_with_its_cause(data, tmp_path):
     words = words_of(data, tmp_path / "run", 100_000, "--processes", "2", "--set", "train.log_every=1")
-    process = subprocess.Popen(command(1, *words), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    process = forked.Forked([*TRAIN, *words])
     try:
         deadline = time.monotonic() + 300
         while not list(Metrics(tmp_path / "run")):
@@ -174,7 +180,7 @@ def test_a_signal_to_one_process_stops_both_after_the_step(data, tmp_path):
     run = tmp_path / "run"
     few = (*SETTINGS, "train.steps=100000", "train.log_every=1")
     settings = [word for setting in few for word in ("--set", setting)]
-    process = subprocess.Popen(command(2, str(data), "--out", str(run), *settings), stdout=subprocess.DEVNULL)
+    process = subprocess.Popen(under_torchrun(str(data), "--out", str(run), *settings), stdout=subprocess.DEVNULL)
     try:
         deadline = time.monotonic() + 300
         while not list(Metrics(run)):

@@ -1,6 +1,5 @@
 """Real processes, really killed: resuming ends in the bits of a training that nothing disturbed."""
 
-import functools
 import hashlib
 import os
 import random
@@ -14,39 +13,38 @@ from pathlib import Path
 
 import pytest
 import toy
+from forked import Forked
 
 from ast_sim.runs import checkpoint
 from ast_sim.runs.metrics import Metrics
 
-STEPS = 90
+STEPS = 60
 SMALL = [
     f"train.steps={STEPS}", "train.batch_size=2", "train.log_every=7", "train.checkpoint_every=3", "train.keep=2",
-    "train.validate_every=30", "train.statistics_pairs=8", "model.hidden=16", "model.decoder_hidden=16",
+    "train.validate_every=20", "train.statistics_pairs=8", "model.hidden=16", "model.decoder_hidden=16",
     "model.d_token=16", "model.heads=1", "model.head_dim=16", "model.ffn_inner=16", "model.L_SA=1", "model.dropout=0.1",
     "train.mirror=x,y", "train.optimizer=muon",  # whose momenta are kept beside the moments of AdamW
 ]  # fmt: skip
 
 
-ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "AST_SIM_DEBUG": "0"}
-
-
 def command(*arguments, settings=()) -> list[str]:
     assignments = [part for setting in settings for part in ("--set", setting)]
-    return [sys.executable, "-m", "ast_sim.cli", "train", *map(str, arguments), *assignments]
+    return ["-m", "ast_sim.cli", "train", *map(str, arguments), *assignments]
 
 
-def start(*arguments, settings=(), **options) -> subprocess.Popen:
-    return subprocess.Popen(
-        command(*arguments, settings=settings),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=ENVIRONMENT,
-        **options,
-    )
+def start(*arguments, settings=(), **options) -> Forked:
+    return Forked(command(*arguments, settings=settings), **options)
 
 
-def finish(process: subprocess.Popen, code: int = 0) -> tuple[str, str]:
+def start_anew(*arguments, settings=(), **options) -> subprocess.Popen:
+    """In a process that is no copy; its output is buffered, as where a user starts it."""
+    words = [sys.executable, *command(*arguments, settings=settings)]
+    environment = {**os.environ, "PYTHONUNBUFFERED": ""}
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    return subprocess.Popen(words, env=environment, **pipes, **options)
+
+
+def finish(process: Forked | subprocess.Popen, code: int = 0) -> tuple[str, str]:
     out, error = process.communicate(timeout=120)
     assert process.returncode == code, error
     return out, error
@@ -58,7 +56,7 @@ def newest(run: Path) -> int:
     return max(steps, default=-1)
 
 
-def wait_for_progress(process: subprocess.Popen, run: Path, beyond: int) -> None:
+def wait_for_progress(process: Forked, run: Path, beyond: int) -> None:
     while newest(run) <= beyond:
         assert process.poll() is None, process.communicate()
         time.sleep(0.005)
@@ -126,8 +124,7 @@ def test_signals_finish_the_step_write_a_checkpoint_and_exit(undisturbed, tmp_pa
     data, expected = undisturbed
     run, reached = tmp_path / "run", -1
     for number, code in ((signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)):
-        heed = functools.partial(signal.signal, number, signal.SIG_DFL)  # the tests themselves may run under nohup
-        process = start(data, "--out", run, "--resume", settings=SMALL, preexec_fn=heed)
+        process = start(data, "--out", run, "--resume", settings=SMALL)
         wait_for_progress(process, run, reached)
         process.send_signal(number)
         out, error = finish(process, code)
@@ -152,9 +149,7 @@ try:
 except KeyboardInterrupt as interrupt:
     print("interrupted:", interrupt, flush=True)
 """
-    words = [sys.executable, "-c", code]
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    process = subprocess.Popen(words, env=ENVIRONMENT, **pipes)
+    process = Forked(["-c", code])
     wait_for_progress(process, run, -1)
     process.send_signal(signal.SIGINT)
     out, _ = finish(process, 0)
@@ -166,7 +161,7 @@ except KeyboardInterrupt as interrupt:
 def test_a_closed_pipe_finishes_the_step_writes_a_checkpoint_and_exits(undisturbed, tmp_path):
     data, expected = undisturbed
     run = tmp_path / "run"
-    process = start(data, "--out", run, settings=SMALL)
+    process = start_anew(data, "--out", run, settings=SMALL)
     process.stdout.close()  # what `ast-sim train ... | head` does
     error = process.stderr.read()
     assert process.wait(timeout=120) == 141, error
@@ -188,8 +183,7 @@ def test_a_closed_pipe_finishes_the_step_writes_a_checkpoint_and_exits(undisturb
 def test_a_process_that_ignores_a_lost_terminal_goes_on(undisturbed, tmp_path):
     data, expected = undisturbed
     run = tmp_path / "run"
-    ignore = lambda: signal.signal(signal.SIGHUP, signal.SIG_IGN)  # noqa: E731 (what nohup does)
-    process = start(data, "--out", run, settings=SMALL, preexec_fn=ignore)
+    process = start(data, "--out", run, settings=SMALL, ignored=[signal.SIGHUP])
     wait_for_progress(process, run, -1)
     process.send_signal(signal.SIGHUP)
     finish(process)
@@ -225,7 +219,7 @@ def test_a_full_disk_is_one_line_and_nothing_is_lost(undisturbed, tmp_path):
         else:
             # No file system of our own: files may not grow beyond this, which fails likewise when they are written.
             limits = (60_000, 60_000)
-            process = start(
+            process = start_anew(
                 data, "--out", run, settings=SMALL, preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, limits)
             )
         _, error = finish(process, 2)
