@@ -91,16 +91,22 @@ class RigidMotion:
         hidden = [time for time in times if np.abs(time - np.asarray(frames)).min() > last * ROUNDING]
         if hidden:
             where = ", ".join(f"{time:.4g}" for time in hidden)
-            yield f"{name} turns at {where} of {last} frames, which no frame shows{self._better(last)}"
+            yield f"{name} turns at {where} of {last} frames, which no frame shows{self._better(hidden, last)}"
         turn = abs(self.rotation) * max(np.diff(frames)) / last
         if turn >= 180 * (1 - ROUNDING):
+            enough = abs(self.rotation) / last < 180 * (1 - ROUNDING)
+            more = "frames between" if enough else f"{int(turn / 180 * (1 + ROUNDING)) + 1} times as many frames"
             yield (
                 f"{name} turns {turn:.4g} degrees from one frame to the next; positions, all that a model sees,"
-                f" look like another turn: take {int(turn / 180 * (1 + ROUNDING)) + 1} times as many frames"
+                f" look like another turn: {'keep' if enough else 'take'} {more}"
             )
 
-    def _better(self, last: int) -> str:
-        """The next number of frames that shows all corners, as the end of a sentence."""
+    def _better(self, hidden: Sequence[float], last: int) -> str:
+        """What shows the corners at these times, as the end of a sentence: frames of the motion that are not stored, or
+        the next number of frames with all corners."""
+        whole = [round(time) for time in hidden]
+        if all(abs(time - frame) <= last * ROUNDING for time, frame in zip(hidden, whole, strict=True)):
+            return f": keep {'frame' if len(whole) == 1 else 'frames'} {', '.join(map(str, whole))}, too"
         for more in range(last, 20 * last):
             if all(abs(more * s - round(more * s)) <= more * ROUNDING for s in self.corners()):
                 return f": with {more + 1} frames one does"

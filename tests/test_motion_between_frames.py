@@ -126,6 +126,15 @@ def test_frames_behind_the_last_one_that_is_kept_do_not_matter():
     assert len(list(path.storing((0, 2, 3)).notes())) == 1
 
 
+def test_frames_that_show_what_the_kept_ones_do_not_are_named():
+    there_and_back = course(RigidMotion([(0, 0, -1), (0, 0, 0)]), 5).storing((0, 4))
+    assert list(there_and_back.notes()) == ["the tool turns at 2 of 4 frames, which no frame shows: keep frame 2, too"]
+    between = course(RigidMotion([(0, 0, -1), (0, 0, 0)]), 6).storing((0, 5))
+    assert list(between.notes()) == ["the tool turns at 2.5 of 5 frames, which no frame shows: with 7 frames one does"]
+    (turn,) = course(RigidMotion(rotation=270), 10).storing((0, 9)).notes()
+    assert turn.endswith("look like another turn: keep frames between")
+
+
 def test_the_motion_of_a_question_tells_it_too():
     kinds = np.array([NodeType.NORMAL] * 4 + [NodeType.OBSTACLE], np.uint8)
     points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]], np.float32)

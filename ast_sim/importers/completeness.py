@@ -21,6 +21,11 @@ _WORDS = {
     "--stress": ("mises", "stress", "s_eq", "seqv"),
     "--body": ("body", "part", "instance"),
 }
+_OF_TENSORS = ("stress", "sig")  # also a field that is called S alone
+# Of several fields for one option, one with these words is proposed.
+_LIKELIEST = {"--displacement": ("disp", "depl"), "--stress": ("mises",)}
+# The options that a field decides alone, in the order of the proposal.
+_PROPOSED = ("--displacement", "--stress", "--obstacle", "--handle")
 
 
 def require_complete(source: Path, trajectory: Trajectory, names: FieldNames, deck: Path | None = None) -> None:
@@ -35,10 +40,14 @@ def require_complete(source: Path, trajectory: Trajectory, names: FieldNames, de
         first = next(iter(frames(source))) if deck is None else None
         unused = _unused(first, names) if first is not None else []
         named = ", ".join(f"{name} ({option})" for option, name in unused)
-        options = " ".join(f"{option} {name}" for option, name in unused if "|" not in option)
-        arguments = ", ".join(f"{option[2:]}={name!r}" for option, name in unused if "|" not in option)
+        proposed = {option: name for option, name in reversed(unused) if option in _PROPOSED}
+        pairs = sorted(proposed.items(), key=lambda pair: _PROPOSED.index(pair[0]))
+        options = " ".join(f"{option} {name}" for option, name in pairs)
+        arguments = ", ".join(f"{option[2:]}={name!r}" for option, name in pairs)
         advice = f"; these fields were not used: {named}" if unused else ""
         advice += f"; try {options}, in Python names=FieldNames({arguments})" if options else ""
+        if source.suffix.lower() == ".frd" and deck is None:
+            advice += "; or name its deck before it, which says what is prescribed: ast-sim convert JOB.inp JOB.frd"
         if first is not None and "displacement" in first.cell_fields.keys() - first.point_fields.keys():
             advice += "; 'displacement' is a cell field, and must be one of points"
         raise DatasetError(
@@ -65,7 +74,8 @@ def _missing(trajectory: Trajectory) -> list[str]:
 
 
 def _unused(frame: SourceMesh, names: FieldNames) -> list[tuple[str, str]]:
-    """(option, name) of the fields that were not used. If only some options can be told, "|" separates them."""
+    """(option, name) of the fields that were not used, the likeliest of each option first. If only some options can be
+    told, "|" separates them."""
     used = {names.displacement or "displacement", names.stress or "von_mises", names.node_type or "node_type"}
     used |= {*(text.partition("=")[0] for text in names.fields), names.reaction}
     used |= {names.obstacle, names.handle, names.body or "body", *names.material_fields}
@@ -75,14 +85,21 @@ def _unused(frame: SourceMesh, names: FieldNames) -> list[tuple[str, str]]:
         for name, values in fields.items():
             if name not in used and values.dtype.kind in "iufb":
                 unused.append((_option(place, name, values.reshape(len(values), -1)), name))
-    order = ["--displacement", "--stress", "--obstacle", "--handle"]
-    return sorted(unused, key=lambda one: order.index(one[0]) if one[0] in order else len(order))
+    return sorted(unused, key=_rank)
+
+
+def _rank(one: tuple[str, str]) -> tuple[int, bool]:
+    option, name = one
+    likely = any(word in name.lower() for word in _LIKELIEST.get(option, ()))
+    return (_PROPOSED.index(option) if option in _PROPOSED else len(_PROPOSED)), not likely
 
 
 def _option(place: str, name: str, values: np.ndarray) -> str:
     """The option that may take a field of this place, name and these values."""
+    if values.shape[1] in (4, 6, 9) and (name.lower() == "s" or any(word in name.lower() for word in _OF_TENSORS)):
+        return "--stress"
     if values.shape[1] > 1:
-        return "--displacement" if place == "point" and values.shape[1] in (2, 3) else "|no option: several components"
+        return "--displacement" if place == "point" and values.shape[1] in (2, 3) else "no option: several components"
     for option, words in _WORDS.items():
         if any(word in name.lower() for word in words) and (place == "point" or option in ("--stress", "--body")):
             return option

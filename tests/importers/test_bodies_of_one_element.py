@@ -9,6 +9,7 @@ from test_jobs import solved
 
 from ast_sim.importers.mesh_file import read_mesh
 from ast_sim.importers.series import FieldNames, read_series
+from ast_sim.support.errors import DatasetError
 
 CORNERS = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)])
 
@@ -56,3 +57,16 @@ def test_a_mesh_that_is_cut_all_over_is_joined(tmp_path, name, form):
     read = read_mesh(tmp_path / name)
     assert len(np.unique(read.elements)) == mesh.num_nodes == 18
     assert "96 points at 18 places are joined: each element has points of its own" in read.notes
+
+
+def test_fields_that_differ_at_points_of_one_place_are_refused_with_the_frames(tmp_path):
+    """In the first frame the stress is the same everywhere, 0."""
+    mesh = block(2, 2, 1)
+    points = mesh.rest_position[mesh.elements].reshape(-1, 3).astype(float)
+    cells = np.arange(len(points)).reshape(-1, 4)
+    for frame in range(3):
+        fields = {"von_mises": np.repeat(np.arange(len(cells)), 4) * 5.0 * frame, "displacement": points * 0.1 * frame}
+        meshio.Mesh(points, [("tetra", cells)], fields).write(tmp_path / f"{frame}.vtu")
+    refused = r"0.vtu and 2 later frames: each element has points of its own, and the field 'von_mises' differs at"
+    with pytest.raises(DatasetError, match=refused):
+        read_series(tmp_path, FieldNames())

@@ -540,6 +540,20 @@ def test_fields_that_were_not_used_are_named_with_their_options(tmp_path):
     assert convert(source, tmp_path / "e.h5", incomplete=True) == counted(1, 1, 1)
 
 
+def test_of_several_fields_for_an_option_the_likeliest_one_is_proposed(tmp_path):
+    scene = block(3, 1, 1)
+    count = scene.num_nodes
+    fields = {"FORC": np.ones((count, 3)), "DISP": np.ones((count, 3)), "STRAIN": np.ones((count, 6))}
+    fields |= {"STRESS_PS1": np.full(count, 0.5), "STRESS": np.ones((count, 6)), "STRESS_Mises": np.full(count, 0.5)}
+    for index in range(2):
+        write_vtu(tmp_path / f"r/{index}.vtu", scene.rest_position, scene.elements, fields)
+    with pytest.raises(DatasetError) as error:
+        convert(tmp_path / "r", tmp_path / "d.h5", splits={"train": ["r"]})
+    assert "; try --displacement DISP --stress STRESS_Mises, in Python names=FieldNames(" in str(error.value)
+    for told in ("FORC (--displacement)", "STRESS (--stress)", "STRAIN (no option: several components)"):
+        assert told in str(error.value)
+
+
 def test_the_motion_of_the_tool_alone_is_nothing_to_learn_from(tmp_path):
     source = unnamed_fields(tmp_path / "r", tool_moves=True)
     names = FieldNames(obstacle="tool", handle="fixed")

@@ -195,8 +195,9 @@ class Stitching:
             return ""
         what, rows = max(self.disagree.items(), key=lambda one: int(one[1].sum()))
         at = self.mesh.points[self.pairs[np.argmax(rows), 0]].tolist()
+        path = self.mesh.path if self.frames == 1 else f"{self.mesh.path} and {counted(self.frames - 1, 'later frame')}"
         return (
-            f"{self.mesh.path}: each element has points of its own, and {what} differs at {rows.sum()} of"
+            f"{path}: each element has points of its own, and {what} differs at {rows.sum()} of"
             f" {counted(len(rows), 'pair')} of points at one place, the first at {at}: average the field at the"
             " points, or leave it out"
         )
