@@ -4,7 +4,7 @@ import h5py
 import meshio
 import numpy as np
 import pytest
-from blocks import block
+from data_samples import block
 
 from ast_sim.importers.convert import find_series
 from ast_sim.importers.mesh_file import read_mesh

@@ -8,7 +8,7 @@ import zipfile
 
 import meshio
 import pytest
-from blocks import block
+from data_samples import block
 
 from ast_sim import cli
 from ast_sim.importers.mesh_file import read_mesh
