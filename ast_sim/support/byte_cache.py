@@ -7,6 +7,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Hashable
 from dataclasses import is_dataclass
 from itertools import islice
+from threading import Lock
 from typing import Any, Generic, TypeVar
 
 from ast_sim.support.environment import processes_on_machine
@@ -32,23 +33,28 @@ class ByteCache(Generic[V]):
     The RECENT values that were used last stay. Of the others the one that was used last is let go first: a training
     asks for all its scenes once in each pass, and what was used longest ago comes next.
 
-    Only one thread at a time may use it.
+    Several threads may use it: a training asks for scenes of its pool while a thread makes the next batch.
     """
 
     def __init__(self, limit: int) -> None:
         self.limit = limit
         self.held = 0
         self._values: OrderedDict[Hashable, tuple[V, int]] = OrderedDict()
+        self._lock = Lock()
 
     def get(self, key: Hashable, make: Callable[[], V]) -> V:
         """The value of a key; `make` makes a missing one. Each call measures the value again: it may have grown."""
-        value, counted = self._values.pop(key, None) or (make(), 0)
+        with self._lock:
+            known = self._values.get(key)
+        value = known[0] if known else make()
         size = array_bytes(value)
-        self._values[key] = value, size
-        self.held += size - counted
-        while self.held > self.limit and len(self._values) > 1:
-            recent = min(RECENT, len(self._values) - 1)
-            self.held -= self._values.pop(next(islice(reversed(self._values), recent, None)))[1]
+        with self._lock:
+            _, counted = self._values.pop(key, (None, 0))
+            self._values[key] = value, size
+            self.held += size - counted
+            while self.held > self.limit and len(self._values) > 1:
+                recent = min(RECENT, len(self._values) - 1)
+                self.held -= self._values.pop(next(islice(reversed(self._values), recent, None)))[1]
         return value
 
 

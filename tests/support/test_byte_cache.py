@@ -1,5 +1,7 @@
 """A cache with a limit of bytes: what is counted, what is let go, what is kept."""
 
+import sys
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -61,3 +63,22 @@ def test_what_could_not_be_made_is_not_kept():
     with pytest.raises(ZeroDivisionError):
         cache.get("a", lambda: 1 / 0)
     assert cache.get("a", lambda: 1) == 1 and cache.held == 0
+
+
+def test_threads_share_a_cache(monkeypatch):
+    """Without an error, and what is held is what is counted."""
+    monkeypatch.setattr(byte_cache, "RECENT", 2)
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    cache = ByteCache(200)
+
+    def use(seed):
+        for key in np.random.default_rng(seed).integers(40, size=5000).tolist():
+            assert cache.get(key, lambda key=key: np.full(10, key, np.uint8))[0] == key
+
+    try:
+        with ThreadPoolExecutor(4) as threads:
+            list(threads.map(use, range(4)))
+    finally:
+        sys.setswitchinterval(interval)
+    assert cache.held == sum(cache.get(key, None).nbytes for key in list(cache._values)) == 200
