@@ -28,6 +28,9 @@ from ast_sim.support.errors import DatasetError, counted
 if TYPE_CHECKING:
     import meshio
 
+# Values of cells that are copies agree to this share of the largest value.
+_ALIKE = 1e-5
+
 
 @dataclass(frozen=True, eq=False)
 class MeshFile:
@@ -41,6 +44,7 @@ class MeshFile:
         node_rows: [n] the point of the file that a point stands for: itself, the one in front of it, or an end of its
             edge.
         element_rows: [E] the cell of the file that an element is part of, counted over all blocks.
+        copies: [C, 2] cells that were left out as copies, and the cells that stand for them; see `Elements`.
         notes: sentences on what was not taken as it is.
         groups: the numbers of the points of each named group.
         shells: if there are shells beside the tetrahedra; their layers are among the elements and the points.
@@ -54,6 +58,7 @@ class MeshFile:
     elements: np.ndarray
     node_rows: np.ndarray
     element_rows: np.ndarray
+    copies: np.ndarray
     notes: list[str]
     groups: dict[str, np.ndarray]
     shells: Shells | None = None
@@ -99,6 +104,20 @@ class MeshFile:
         """From values at the points of the file to values at the points `used`."""
         return lambda values: self.between(values[self.node_rows])[used]
 
+    def at_elements(self, values: np.ndarray) -> np.ndarray:
+        """From values at the cells of the file to values at the elements. A note says if copies have other ones."""
+        left_out, kept = values[self.copies.T]
+        scale = np.nanmax(np.abs(values), initial=0.0)
+        alike = np.isclose(left_out, kept, rtol=0, atol=_ALIKE * scale, equal_nan=True)
+        others = int((~alike).any(axis=tuple(range(1, alike.ndim))).sum())
+        have = counted(
+            others, "element that stands in the file twice has", "elements that stand in the file twice have"
+        )
+        note = f"{have} other values there: the first ones are taken"
+        if others and note not in self.notes:
+            self.notes.append(note)
+        return values[self.element_rows]
+
     def field(self, place: str, name: str) -> np.ndarray:
         """A field of a `place`, "point" or "cell", as [n or E, columns] float64.
 
@@ -106,7 +125,7 @@ class MeshFile:
             DatasetError: there is no such field, or it does not hold numbers.
         """
         values = raw_field(self.source, place, name)
-        return self.between(values[self.node_rows]) if place == "point" else values[self.element_rows]
+        return self.between(values[self.node_rows]) if place == "point" else self.at_elements(values)
 
     def numbers(self, place: str, name: str) -> np.ndarray:
         """A field with one number in each row, as [rows]; see `field`."""
@@ -268,7 +287,7 @@ def mesh_of(mesh: SourceMesh, stitching: Stitching, corners: bool = False) -> Me
         elements = np.concatenate([elements, shells.tetrahedra(points)])
         node_rows = np.concatenate([node_rows, shells.nodes])
         element_rows = np.concatenate([element_rows, np.repeat(rows, 3)])
-    made = MeshFile(mesh, points, elements, node_rows, element_rows, notes, groups, shells)
+    made = MeshFile(mesh, points, elements, node_rows, element_rows, taken.copies, notes, groups, shells)
     plain = replace(made, mirrored=taken.mirrored, reduced=taken.reduced)
     return plain if taken.middles is None else _of_second_order(plain, taken.middles)
 

@@ -148,7 +148,7 @@ def read_series(
     scene = replace(scene, material=_material(mesh, names, job is not None))
     stress, more = _stress(mesh, kept, used, place, scene, _pascals(names))
     rigid = {at: ~scene.deforming(at) for at in ("node", "element")}
-    fields, missing = further.named(source, mesh.at_nodes(used), mesh.element_rows, rigid, names.newton)
+    fields, missing = further.named(source, mesh.at_nodes(used), mesh.at_elements, rigid, names.newton)
     done = {name: 1 for name, is_so in ((MIRRORED, mesh.mirrored), (CORNERS_ONLY, mesh.reduced)) if is_so}
     trajectory = Trajectory(
         scene,
@@ -277,7 +277,7 @@ def _stress(
     if place == "node":
         values = list(map(mesh.at_nodes(used), kept.stresses))
     else:
-        values = [values[mesh.element_rows] for values in kept.stresses]
+        values = list(map(mesh.at_elements, kept.stresses))
     stress = (pascals * np.stack(values)).astype(np.float32)[:, :, None]
     lacking = np.isnan(stress[:, :, 0]).any(axis=0) & ~scene.deforming(place)
     if not lacking.any():

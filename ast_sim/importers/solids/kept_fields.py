@@ -77,7 +77,7 @@ class KeptFields:
         self,
         path: Path,
         at_nodes: Callable[[np.ndarray], np.ndarray],
-        element_rows: np.ndarray,
+        at_elements: Callable[[np.ndarray], np.ndarray],
         rigid: dict[str, np.ndarray],
         newton: float,
     ) -> tuple[dict[str, NamedField], list[str]]:
@@ -85,7 +85,7 @@ class KeptFields:
 
         Args:
             at_nodes: from values [points of the file, c] to values [N, c].
-            element_rows: [E] the cells of the elements.
+            at_elements: from values [cells of the file, c] to values [E, c].
             rigid: at "node" and "element", which rows are of obstacles: there a missing number is 0, with a note.
             newton: the unit of force of the files, in newton.
 
@@ -96,7 +96,7 @@ class KeptFields:
         notes = []
         for key, frames in self.frames.items():
             place = self.places[key]
-            rows = [at_nodes(values) if place == "node" else values[element_rows] for values in frames]
+            rows = [at_nodes(values) if place == "node" else at_elements(values) for values in frames]
             values = np.stack(rows) * (newton if key == REACTION else 1.0)
             lacking = np.isnan(values).any(axis=(0, 2))
             if (lacking & ~rigid[place]).any():

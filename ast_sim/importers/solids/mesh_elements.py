@@ -28,6 +28,8 @@ class Elements:
         middles: [E, 6] int64 points of the file in the middles of the edges of tetrahedra, `NO_NODE` where an element
             has none; None if none has any.
         rows: [E] int64 the cell that each is part of, counted over all blocks of the file.
+        copies: [C, 2] int64 the cells that are left out since their nodes are the nodes of a cell before them, and that
+            cell.
         blocks: the numbers of the blocks that became elements.
         notes: sentences on what was changed.
         mirrored: whether all elements were inside out.
@@ -37,6 +39,7 @@ class Elements:
     nodes: np.ndarray
     middles: np.ndarray | None
     rows: np.ndarray
+    copies: np.ndarray
     blocks: list[int]
     notes: list[str]
     mirrored: bool = False
@@ -62,15 +65,14 @@ def elements_of(mesh: SourceMesh, point_of: np.ndarray, corners: bool = False) -
             " and quadrilaterals alone: mesh the bodies with tetrahedra"
         )
     starts = np.cumsum([0, *(len(block.nodes) for block in mesh.blocks)])
-    nodes, middles, rows, told = [], [], [], []
-    twice = 0
+    nodes, middles, rows, copies, told = [], [], [], [], []
     for shape in dict.fromkeys(mesh.blocks[index].shape for index in chosen):
         of_shape = [index for index in chosen if mesh.blocks[index].shape == shape]
         cells = np.concatenate([point_of[mesh.blocks[index].corners] for index in of_shape])
         middle = np.concatenate([middles_of(mesh.blocks[index], point_of) for index in of_shape])
         row = np.concatenate([starts[index] + np.arange(len(mesh.blocks[index].nodes)) for index in of_shape])
-        first = _first_of_its_nodes(cells)
-        twice += len(cells) - len(first)
+        first, copy = _first_of_its_nodes(cells)
+        copies.append(row[copy])
         cells, middle, row = cells[first], middle[first], row[first]
         if shape == "tetra":
             _require_proper(mesh, cells, row)
@@ -87,19 +89,23 @@ def elements_of(mesh: SourceMesh, point_of: np.ndarray, corners: bool = False) -
         rows.append(row)
     reduced = _reduced(mesh, chosen, corners)
     said = [*reduced, *told]
-    if twice:
-        are = counted(twice, "element that stands in the file twice is", "elements that stand in the file twice are")
+    copy = np.concatenate(copies)
+    if len(copy):
+        are = counted(
+            len(copy), "element that stands in the file twice is", "elements that stand in the file twice are"
+        )
         said.append(f"{are} taken once")
     elements, middle, row = (np.concatenate(parts) for parts in (nodes, middles, rows))
     if dimension == 2:
-        return Elements(elements, None, row, chosen, said, reduced=bool(reduced))
+        return Elements(elements, None, row, copy, chosen, said, reduced=bool(reduced))
     second = not corners and bool((middle != NO_NODE).any())
     if second:
         require_near(mesh, elements, middle, row)
     turned, more = _turned_over(mesh, elements, row, starts)
     elements, middle = turned_over(elements, turned), turned_over(middle, turned)
     mirrored = bool(turned.all()) and all(mesh.blocks[index].shape != "wedge" for index in chosen)
-    return Elements(elements, middle if second else None, row, chosen, [*said, *more], mirrored, bool(reduced))
+    middle = middle if second else None
+    return Elements(elements, middle, row, copy, chosen, [*said, *more], mirrored, bool(reduced))
 
 
 def _reduced(mesh: SourceMesh, chosen: list[int], corners: bool) -> list[str]:
@@ -114,12 +120,14 @@ def _reduced(mesh: SourceMesh, chosen: list[int], corners: bool) -> list[str]:
     ]
 
 
-def _first_of_its_nodes(cells: np.ndarray) -> np.ndarray:
-    """The rows of cells whose nodes are not the nodes of a cell before them, in ascending order."""
+def _first_of_its_nodes(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The rows of cells whose nodes are not the nodes of a cell before them, in ascending order; and [C, 2] the others,
+    each with the first cell of its nodes."""
     ordered = np.sort(cells, axis=1)
     order = np.lexsort(ordered.T)
     new = np.append(True, (ordered[order[1:]] != ordered[order[:-1]]).any(axis=1)) if len(cells) else order == 0
-    return np.sort(order[new])  # lexsort is stable: the first of equal rows comes first
+    first = order[new][np.cumsum(new) - 1]  # lexsort is stable: the first of equal rows comes first
+    return np.sort(order[new]), np.stack([order[~new], first[~new]], axis=1)
 
 
 def _require_proper(mesh: SourceMesh, cells: np.ndarray, rows: np.ndarray) -> None:
