@@ -18,7 +18,7 @@ from ast_sim.importers.formats.source_mesh import SourceMesh, from_meshio
 from ast_sim.importers.frames_in_file import frames_in
 from ast_sim.importers.places import Mask, marked
 from ast_sim.importers.shells import Shells, find_shells
-from ast_sim.importers.solids.mesh_elements import Elements, elements_of
+from ast_sim.importers.solids.mesh_elements import Elements, elements_of, told_of_copies
 from ast_sim.importers.solids.middles import NO_NODE, completed
 from ast_sim.importers.solids.stitching import Stitching
 from ast_sim.number_arrays import connected_parts
@@ -27,9 +27,6 @@ from ast_sim.support.errors import DatasetError, counted
 
 if TYPE_CHECKING:
     import meshio
-
-# Values of cells that are copies agree to this share of the largest value.
-_ALIKE = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,16 +103,8 @@ class MeshFile:
 
     def at_elements(self, values: np.ndarray) -> np.ndarray:
         """From values at the cells of the file to values at the elements. A note says if copies have other ones."""
-        left_out, kept = values[self.copies.T]
-        scale = np.nanmax(np.abs(values), initial=0.0)
-        alike = np.isclose(left_out, kept, rtol=0, atol=_ALIKE * scale, equal_nan=True)
-        others = int((~alike).any(axis=tuple(range(1, alike.ndim))).sum())
-        have = counted(
-            others, "element that stands in the file twice has", "elements that stand in the file twice have"
-        )
-        note = f"{have} other values there: the first ones are taken"
-        if others and note not in self.notes:
-            self.notes.append(note)
+        told = told_of_copies(values, self.copies) if len(self.copies) else []
+        self.notes.extend(note for note in told if note not in self.notes)
         return values[self.element_rows]
 
     def field(self, place: str, name: str) -> np.ndarray:

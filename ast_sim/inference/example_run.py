@@ -13,7 +13,7 @@ def example_run(name: str) -> Run:
     """A trained run that comes with the package; nothing is fetched.
 
     "plates": clamped plates of about 400 nodes that a rigid obstacle presses in (the family "deforming_plate"), lengths
-    in metres. It is the row `plates400` of the study of jumps: `docs/results/jumps.md` has its errors and times.
+    in metres. It is the row `plates400_long` of the study of jumps: `docs/results/jumps.md` has its errors and times.
     "clip": the metal clip of `examples/clip`, which keeps a permanent set, with about 3,600 nodes; lengths in
     millimetres. `docs/results/clip.md` has its errors and times.
 

@@ -61,10 +61,9 @@ def in_trajectory(trajectory: Trajectory, dynamic: bool = False) -> list[Finding
     findings += _turn_over(scene, position)
     if dynamic:
         findings += _stops_dead(position)
-    elif "source" in trajectory.attributes:  # of other programs: of the bundled solver, a pause is one
-        findings += _pauses(position)
-    if not dynamic:
-        findings += negative_work(trajectory)
+    else:
+        of_others = "source" in trajectory.attributes  # of the bundled solver, a pause is one
+        findings += [*(_pauses(position) if of_others else ()), *negative_work(trajectory)]
     findings += negative_stress(trajectory)
     findings += [*change_places(scene, position), *counted_from_frame_before(scene, position)]
     return [*findings, *_contact(scene, position)]

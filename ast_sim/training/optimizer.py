@@ -38,8 +38,8 @@ class Optimizer:
         others = [p for p, is_inside in zip(parameters, inside, strict=True) if not is_inside]
         values, self.gradient = _in_one_array([*others, *matrices])
         rest = sum(p.numel() for p in others)
-        self._rest = nn.Parameter(values[:rest])
-        self._rest.grad = self.gradient[:rest]
+        self._rest = values[:rest]
+        self._rest_gradient = self.gradient[:rest]
         self._moments: dict[str, Tensor] = {}
         self._muon = None
         if matrices:
@@ -58,15 +58,14 @@ class Optimizer:
     def step(self, rate: float) -> None:
         """Move the parameters against the gradient with this learning rate."""
         if not self._moments:
-            zeros = {name: torch.zeros_like(self._rest.detach()) for name in ("exp_avg", "exp_avg_sq")}
+            zeros = {name: torch.zeros_like(self._rest) for name in ("exp_avg", "exp_avg_sq")}
             self._moments = {"step": torch.zeros((), device=self._rest.device), **zeros}
-        # The class AdamW would import the compiler of torch and SymPy: two seconds of the processor for each training.
-        with torch.no_grad():
-            adamw(
-                [self._rest], [self.gradient[: self._rest.numel()]], [self._moments["exp_avg"]],
-                [self._moments["exp_avg_sq"]], [], [self._moments["step"]], fused=True, amsgrad=False,
-                beta1=0.9, beta2=0.999, lr=rate, weight_decay=0.0, eps=1e-8, maximize=False,
-            )  # fmt: skip
+        # The class AdamW would import the compiler of torch and SymPy: three seconds of the processor a training.
+        adamw(
+            [self._rest], [self._rest_gradient], [self._moments["exp_avg"]], [self._moments["exp_avg_sq"]], [],
+            [self._moments["step"]], fused=True, amsgrad=False, beta1=0.9, beta2=0.999, lr=rate, weight_decay=0.0,
+            eps=1e-8, maximize=False,
+        )  # fmt: skip
         if self._muon is not None:
             self._muon.step(rate)
 

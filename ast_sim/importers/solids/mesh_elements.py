@@ -18,6 +18,9 @@ from ast_sim.importers.solids.middles import NO_NODE, middles_of, require_near
 from ast_sim.importers.solids.splitting import tetrahedra_of, triangles_of
 from ast_sim.support.errors import DatasetError, counted
 
+# Values of cells that are copies agree to this share of the largest value.
+_ALIKE = 1e-5
+
 
 @dataclass(frozen=True, eq=False)
 class Elements:
@@ -118,6 +121,16 @@ def _reduced(mesh: SourceMesh, chosen: list[int], corners: bool) -> list[str]:
         f"{counted(count, f'cell of the kind {kind} keeps its', f'cells of the kind {kind} keep their')} corners only"
         for kind, count in counts.items()
     ]
+
+
+def told_of_copies(values: np.ndarray, copies: np.ndarray) -> list[str]:
+    """A note if values at the cells of the file are others at `copies`, as of `Elements`, than at their first cells."""
+    left_out, kept = values[copies.T]
+    scale = np.nanmax(np.abs(values), initial=0.0)
+    alike = np.isclose(left_out, kept, rtol=0, atol=_ALIKE * scale, equal_nan=True)
+    others = int((~alike).any(axis=tuple(range(1, alike.ndim))).sum())
+    have = counted(others, "element that stands in the file twice has", "elements that stand in the file twice have")
+    return [f"{have} other values there: the first ones are taken"] if others else []
 
 
 def _first_of_its_nodes(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
