@@ -239,6 +239,11 @@ class Motion:
             numbers = self.position[frame, node].tolist()
             raise ConfigError(f"the motion is not finite in frame {frame} at node {node}: {numbers}")
 
+    def from_rest(self, scene: Scene) -> Motion:
+        """This motion, with the scene at rest before it if prescribed nodes have left their places in frame 0."""
+        away = self.position[0, scene.prescribed] != scene.rest_position[scene.prescribed]
+        return Motion(np.concatenate([scene.rest_position[None], self.position])) if away.any() else self
+
     def increments(self, scene: Scene) -> list[float]:
         """S - 1 numbers: the largest displacement of a prescribed node from one frame to the next."""
         return [_largest(after - before) for before, after in pairwise(self._prescribed(scene))]

@@ -130,8 +130,8 @@ class GuardedFile:
                 arrays |= self._hashes_of_fields(self.child(group, FIELDS, h5py.Group))
         self._verify(str(group.name), trajectory_hash(arrays, attributes), attributes.get(HASH))
 
-    def stored_hash(self, group: h5py.Group) -> str:
-        """The hash that a trajectory was written with; nothing is compared."""
+    def stored_hash(self, group: h5py.Group | h5py.Dataset) -> str:
+        """The hash that a trajectory or an array was written with; nothing is compared."""
         with self.reading(f"the hash of {_path(group)}"):
             return str(plain_value(group.attrs[HASH]))
 

@@ -27,7 +27,7 @@ from ast_sim.plausibility.across import AcrossSimulations
 from ast_sim.plausibility.findings import Finding, refusal, told, wrong
 from ast_sim.scene import Trajectory
 from ast_sim.support.argument_checks import file_name, require_bool, require_type, several
-from ast_sim.support.errors import ConfigError, DatasetError, LooksWrong, nearest_name, warn
+from ast_sim.support.errors import ConfigError, DatasetError, LooksWrong, counted, nearest_name, warn
 from ast_sim.support.progress import Progress, ShowProgress
 
 SHARES = {"train": 0.8, "valid": 0.1, "test": 0.1}
@@ -208,7 +208,7 @@ def _facts_of_the_first(trajectory: Trajectory) -> dict[str, Any]:
 
 def _line(split: str, name: str, trajectory: Trajectory) -> str:
     """What was read of a simulation."""
-    size = f"{trajectory.num_frames} frames of {trajectory.scene.num_nodes} nodes"
+    size = f"{counted(trajectory.num_frames, 'frame')} of {counted(trajectory.scene.num_nodes, 'node')}"
     notes = trajectory.attributes.get("notes")
     return f"{split}: {name}, {size}" + (f"; {notes}" if notes else "")
 

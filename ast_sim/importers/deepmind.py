@@ -85,7 +85,7 @@ def convert_deepmind(
     with FittedWriter(out, **facts) as writer, Progress(total, "trajectories", progress) as bar:
         for split, path in files.items():
             for trajectory in read_trajectories(path, meta, limit, every):
-                size = f"{trajectory.num_frames} frames of {trajectory.scene.num_nodes} nodes"
+                size = f"{counted(trajectory.num_frames, 'frame')} of {counted(trajectory.scene.num_nodes, 'node')}"
                 writer.add(split, trajectory)
                 bar.advance(f"{split}: {path.name} {writer.counts[split] - 1}, {size}")
                 del trajectory  # to free its memory before the next one is read
@@ -139,7 +139,7 @@ class _Record:
             return np.frombuffer(values, dtype).reshape(shape)
         except (ValueError, OverflowError) as error:
             raise DatasetError(
-                f"{self.where}: the feature {name} has {len(values)} bytes; {META} says {dtype.name}"
+                f"{self.where}: the feature {name} has {counted(len(values), 'byte')}; {META} says {dtype.name}"
                 f" {list(shape)}, a multiple of {abs(math.prod(shape)) * dtype.itemsize} bytes"
             ) from error
 

@@ -19,10 +19,10 @@ from ast_sim.importers.formats.source_mesh import CellBlock, SourceMesh
 from ast_sim.importers.formats.stl_file import BadSurface, read_stl
 from ast_sim.importers.formats.text_meshes import reader_of
 from ast_sim.importers.formats.vtk_files import BLOCKS, ENDINGS, XML, is_dyna, vtk_frames
-from ast_sim.importers.meshio_files import BY_MESHIO, by_meshio
+from ast_sim.importers.meshio_kinds.meshio_files import BY_MESHIO, by_meshio
+from ast_sim.importers.meshio_kinds.xdmf.xdmf_frames import xdmf_frames
 from ast_sim.importers.msh.gmsh_fields import has_steps
 from ast_sim.importers.msh.gmsh_files import gmsh_frames
-from ast_sim.importers.xdmf.xdmf_frames import xdmf_frames
 from ast_sim.support.errors import DatasetError
 
 # Formats whose files hold all frames of a simulation.

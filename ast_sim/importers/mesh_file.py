@@ -148,11 +148,11 @@ class MeshFile:
         a block lacks the field. Notes say at how many points it is NaN, and negative, which may mean no mark."""
         values = self.numbers("point", name)
         used = values[np.unique(self.elements)]
-        for rows, note in (
-            (np.isnan(used), "is NaN at {} nodes: they are not marked"),
-            (used < 0, "is negative at {} nodes: they are marked, as all where it is not 0"),
+        for rows, what, then in (
+            (np.isnan(used), "NaN", "not marked"),
+            (used < 0, "negative", "marked, as all where it is not 0"),
         ):
-            told = f"the field {name!r} {note.format(rows.sum())}"
+            told = f"the field {name!r} is {what} at {counted(rows.sum(), 'node: it is', 'nodes: they are')} {then}"
             if rows.any() and told not in self.notes:
                 self.notes.append(told)
         return self._kept(marked(values))

@@ -108,11 +108,15 @@ def read_scene(
 
 def describe(scene: Scene) -> list[str]:
     """A line on the scene, and one on each body: its nodes by type, its elements, its bounding box."""
-    kind = {3: "triangles", 4: "tetrahedra", 10: "second-order tetrahedra"}[scene.elements.shape[1]]
+    kind, kinds = {
+        3: ("triangle", "triangles"),
+        4: ("tetrahedron", "tetrahedra"),
+        10: ("second-order tetrahedron", "second-order tetrahedra"),
+    }[scene.elements.shape[1]]
     body_of_element = scene.body[scene.elements[:, 0]]
     lines = [
         f"{counted(len(np.unique(scene.body)), 'body', 'bodies')}, {counted(scene.num_nodes, 'node')},"
-        f" {scene.num_elements:,} {kind}"
+        f" {counted(scene.num_elements, kind, kinds)}"
     ]
     for body in np.unique(scene.body):
         nodes = scene.body == body
@@ -121,8 +125,8 @@ def describe(scene: Scene) -> list[str]:
         points = scene.rest_position[nodes]
         box = zip("xyz", points.min(axis=0), points.max(axis=0), strict=True)
         extent = ", ".join(f"{axis} {low:.6g} to {high:.6g}" for axis, low, high in box)
-        elements = (body_of_element == body).sum()
-        lines.append(f"body {body}: {counted(nodes.sum(), 'node')} ({types}), {elements:,} {kind}, {extent}")
+        elements = counted((body_of_element == body).sum(), kind, kinds)
+        lines.append(f"body {body}: {counted(nodes.sum(), 'node')} ({types}), {elements}, {extent}")
     return lines
 
 

@@ -22,7 +22,7 @@ from itertools import count, islice
 from pathlib import Path
 from typing import BinaryIO
 
-from ast_sim.support.errors import DatasetError, require
+from ast_sim.support.errors import DatasetError, counted, require
 
 _HEADER = struct.Struct("<QI")
 _CHECKSUM = struct.Struct("<I")
@@ -76,7 +76,8 @@ def _payload(file: BinaryIO, size: int, where: str) -> bytes:
         data = file.read(count)
         if len(data) < count:
             raise DatasetError(
-                f"{where}: its {what} has {count} bytes, but {len(data)} are left: the file is truncated"
+                f"{where}: its {what} has {counted(count, 'byte')}, but {counted(len(data), 'is', 'are')} left: the"
+                " file is truncated"
             )
         return data
 
@@ -87,11 +88,12 @@ def _payload(file: BinaryIO, size: int, where: str) -> bytes:
     left = size - file.tell()
     if length > left - _CHECKSUM.size:
         raise DatasetError(
-            f"{where}: it declares {length} bytes, but {left} are left: the file is truncated or damaged"
+            f"{where}: it declares {counted(length, 'byte')}, but {counted(left, 'is', 'are')} left: the file is"
+            " truncated or damaged"
         )
     payload = take(length, "payload")
     if _CHECKSUM.pack(masked_crc(payload)) != take(_CHECKSUM.size, "checksum"):
-        raise DatasetError(f"{where}: the checksum of its {length} bytes does not fit: the file is damaged")
+        raise DatasetError(f"{where}: the checksum of its {counted(length, 'byte')} does not fit: the file is damaged")
     return payload
 
 
@@ -171,8 +173,8 @@ def _fields(payload: bytes, span: Span, message: str, known: tuple[int, ...], wh
         length, at = _varint(payload, at, end, where)
         if length > end - at:
             raise DatasetError(
-                f"{where}: field {number} of {message} at byte {start} of the record declares {length} bytes,"
-                f" but {end - at} are left"
+                f"{where}: field {number} of {message} at byte {start} of the record declares"
+                f" {counted(length, 'byte')}, but {counted(end - at, 'is', 'are')} left"
             )
         yield number, (at, at + length)
         at += length

@@ -193,12 +193,14 @@ class Answer:
 
     @property
     def trajectory(self) -> Trajectory:
-        """The answer as a trajectory, in ascending order of the frames. Attributes: origin, given frames, seconds."""
+        """The answer as a trajectory, in ascending order of the frames. Attributes: origin, notes, given frames,
+        seconds."""
         order = np.argsort(self.frames, kind="stable")
         frames = tuple(self.frames[row] for row in order)
         attributes = {
             "status": "complete" if self.failure is None else "truncated",
             **self.source,
+            **({"notes": "; ".join(self.notes)} if self.notes else {}),  # a file is read without the warnings
             "given_frames": self.given,
             "model_seconds": list(self.step_seconds),
             **({"last_newton_steps": list(self.last_steps)} if self.last_steps else {}),

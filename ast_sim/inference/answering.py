@@ -59,13 +59,18 @@ def doubts(answer: Answer) -> list[str]:
             f"the Newton steps have not converged: the last one has a size of {max(answer.last_steps):.2g}"
             " (Answer.last_steps)"
         )
+    return [*told, *impossible(answer)]
+
+
+def impossible(answer: Answer) -> list[str]:
+    """The elements of deforming bodies that are turned over, in the first frame that has some, as a sentence."""
     counts = (turned_over(answer.scene, position) for position in answer.position)
     first = next(((frame, count) for frame, count in zip(answer.frames, counts, strict=False) if count), None)
-    if first is not None:
-        frame, count = first
-        over = counted(int(count), "element is", "elements are")
-        told.append(f"{over} turned over in frame {frame}, which no body can do (Answer.check)")
-    return told
+    if first is None:
+        return []
+    frame, count = first
+    over = counted(int(count), "element is", "elements are")
+    return [f"{over} turned over in frame {frame}, which no body can do (Answer.check)"]
 
 
 def _moved_question(question: Question, shift: np.ndarray) -> Question:

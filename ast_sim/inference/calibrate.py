@@ -6,7 +6,6 @@ import math
 import os
 import warnings
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -48,8 +47,9 @@ def calibrate(
     is chosen for a wanted error; then answers with these efforts have a band.
 
     The scenes must be new to the run: they have neither trained nor chosen it. Scenes outside the ranges of the
-    training do not count, since no band is given there; neither do scenes without motion. A warning says how many. The
-    folder of a run keeps the result beside its best checkpoint, and `Run.save` takes it along.
+    training do not count, since no band is given there; neither do scenes without motion, nor scenes of another dataset
+    that have trained or chosen the run all the same, as after a second conversion. Warnings say how many. The folder of
+    a run keeps the result beside its best checkpoint, and `Run.save` takes it along.
 
     Args:
         run: the run. A file is not changed: only this object knows the band, and a file that `run.save` writes of it.
@@ -62,17 +62,20 @@ def calibrate(
     """
     require_runs(run)
     with run.open(data) as dataset:
-        require_new_scenes(run, dataset, split)
+        known = _known_scenes(run, dataset, split)
         run.folder.require_best()  # which will keep the result
         require_known_weights(run, "calibrate")
         before = run.calibration
         run.calibration = None  # it has no say in which scenes count
         try:
-            result, left_out = _measured(run, dataset, split, progress)
+            result, left_out = _measured(run, dataset, split, known, progress)
         except BaseException:
             run.calibration = before
             raise
     run.calibration = result
+    if known:
+        count = counted(len(known), "scene does", "scenes do")
+        warn(f"{count} not count, which have trained or chosen the run; the first is {known[0]}")
     if left_out:
         count = counted(len(left_out), "scene does", "scenes do")
         warn(f"{count} not count, outside the training or without motion; the first is {left_out[0]}")
@@ -88,13 +91,22 @@ def require_runs(*runs: Any) -> None:
         require_type("a run", run, Run, "a Run, such as ast_sim.Run(folder)")
 
 
-def require_new_scenes(run: Run, dataset: Dataset, split: str) -> None:
-    """Raise ConfigError if the scenes of a split have trained or chosen the run. A copy of its dataset is known."""
-    if split in ("train", "valid") and (
-        Path(run.settings.data).resolve() == dataset.path.resolve()
-        or run.folder.origin.get("data") == dataset.fingerprint()
-    ):
+def _known_scenes(run: Run, dataset: Dataset, split: str) -> list[str]:
+    """The names of the scenes of a split that have trained or chosen the run; raise ConfigError if all have."""
+    known = run.folder.learned(dataset, split)
+    if known and len(known) == dataset.count(split):
         raise ConfigError(f"the scenes of {split} have trained or chosen the run: take other scenes")
+    return [f"{split}/{index:06d}" for index in known]
+
+
+def require_new_scenes(run: Run, dataset: Dataset, split: str) -> None:
+    """Raise ConfigError if scenes of a split have trained or chosen the run, in whatever dataset they stand now."""
+    known = _known_scenes(run, dataset, split)
+    if known:
+        raise ConfigError(
+            f"{len(known)} of {counted(dataset.count(split), 'scene')} of {split} have trained or chosen the run, the"
+            f" first is {known[0]}: take other scenes"
+        )
 
 
 class _Measured(NamedTuple):
@@ -113,18 +125,22 @@ class _Measured(NamedTuple):
     latents: np.ndarray | None
 
 
-def _measured(run: Run, dataset: Dataset, split: str, progress: ShowProgress) -> tuple[Calibration, list[str]]:
-    """The calibration by the scenes of a split, and the names of the scenes that do not count."""
+def _measured(
+    run: Run, dataset: Dataset, split: str, known: Sequence[str], progress: ShowProgress
+) -> tuple[Calibration, list[str]]:
+    """The calibration by the scenes of a split without the `known` ones, and the names of the others that do not
+    count."""
     to_choose = choices(run.settings.model, run.settings.train.corrections)
     efforts = to_choose if run.effort in to_choose else (*to_choose, run.effort)
     scenes: list[_Measured] = []
     fields = judging_fields(run.settings.model)
-    names = [f"{split}/{index:06d}" for index in range(dataset.count(split))]
-    left_out = [name for index, name in enumerate(names) if not _counts(run, dataset.load(split, index, fields), name)]
-    _require_enough(len(names), len(left_out))
+    every = [f"{split}/{index:06d}" for index in range(dataset.count(split))]
+    names = {index: name for index, name in enumerate(every) if name not in known}
+    left_out = [name for index, name in names.items() if not _counts(run, dataset.load(split, index, fields), name)]
+    _require_enough(len(every), len(known), len(left_out))
     with Progress(len(names), "scenes", progress) as bar, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what they tell is counted here
-        for index, name in enumerate(names):
+        for index, name in names.items():
             if name not in left_out:
                 truth = dataset.load(split, index, fields)
                 scenes.append(_measured_scene(run, truth, name, efforts, to_choose))
@@ -144,10 +160,11 @@ def _counts(run: Run, truth: Trajectory, name: str) -> bool:
     return moves(truth) and not new_question(run.settings.model, run.scope, truth, None, None, name, None).notes
 
 
-def _require_enough(scenes: int, left_out: int) -> None:
+def _require_enough(scenes: int, known: int, left_out: int) -> None:
     """Raise ConfigError if too few of the scenes are left for a band."""
-    if scenes - left_out < FEWEST:
-        without = f", {left_out} of which lie outside the training or do not move" if left_out else ""
+    if scenes - known - left_out < FEWEST:
+        reasons = {"have trained or chosen the run": known, "lie outside the training or do not move": left_out}
+        without = "".join(f", {count} of which {reason}" for reason, count in reasons.items() if count)
         raise ConfigError(
             f"a band of {100 * LEVEL:g} % needs at least {FEWEST} calibration scenes, and there are {scenes}{without}:"
             " make more with generate(..., calibration=N) (--calibration N)"

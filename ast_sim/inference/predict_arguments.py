@@ -64,9 +64,9 @@ def new_question(
         stress = _given_stress(config, scene, stress, name)
         fields = {} if stress is None else {STRESS: stress}
         times = None
+    _require_resolved(scene, name)  # else a mesh that was rounded flat is said to need a repair
     scene.require_predictable(name)  # before anything is told of such a scene
     _require_material(config, scope, scene, name)
-    _require_resolved(scene, name)
     notes = (
         *notes,
         *_loose(scene),
@@ -99,7 +99,7 @@ def _require_resolved(scene: Scene, name: str) -> None:
     farthest = np.abs(scene.rest_position).max()
     coarse = float(np.spacing(farthest))
     spacing = spacing_of(scene)
-    if coarse > LEAST_RESOLVED * spacing:
+    if coarse > LEAST_RESOLVED * spacing > 0:
         raise DatasetError(
             f"{name} lies {farthest:.3g} from the origin, where single precision keeps steps of {coarse:.2g}, and its"
             f" edges have a mean length of {spacing:.2g}: move it to the origin before its positions are rounded"

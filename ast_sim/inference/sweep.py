@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ast_sim.inference.answer import Answer
+from ast_sim.inference.answering import impossible
 from ast_sim.inference.assembly_questions import ask
 from ast_sim.inference.effort import Effort
 from ast_sim.inference.promises.chosen_effort import ErrorLimit
@@ -33,7 +34,8 @@ class Sweep:
     Attributes:
         rows: one for each set of values: the parameters by name, then `travel_of_nodes` (the largest travel of a
             prescribed node), `reaction` (newton) with its components, `largest_stress` (pascal) and where it is
-            (`stress_at_x`, ...), and `last_newton_step` (see `Answer.last_steps`).
+            (`stress_at_x`, ...), `last_newton_step` (see `Answer.last_steps`), and `notes` where there are some: what
+            lies outside the training, and elements that are turned over.
         varied: the names of the parameters that differ between rows.
         length_unit: unit of all lengths.
         seconds: wall seconds of the model alone, for all rows.
@@ -106,7 +108,8 @@ def sweep(
     choice = {"effort": effort} if error is None else {"error": error}
     table = []
     seconds = 0.0
-    notes = []
+    outside: list[str] = []
+    folded: list[str] = []
     unpromised = 0
     with Progress(len(rows), "rows", progress) as bar:
         for start in range(0, len(rows), TOGETHER):
@@ -117,30 +120,39 @@ def sweep(
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # told once for all rows
                 answers = predict_scenes(scenes, names=names, frames=wanted, throw=False, progress=False, **choice)
-            told = [(*one.notes, *answer.notes) for one, answer in zip(questions, answers, strict=True)]
-            notes += [f"{name}: {note}" for name, row in zip(names, told, strict=True) for note in row]
-            table += [_row(one.values, answer, one.origin) for one, answer in zip(questions, answers, strict=True)]
+            for one, answer in zip(questions, answers, strict=True):
+                notes = [*one.notes, *answer.notes]
+                over = impossible(answer)
+                outside += [f"{answer.name}: {note}" for note in notes[:1]]
+                folded += [f"{answer.name}: {text}" for text in over]
+                table.append(_row(one.values, answer, one.origin, [*notes, *over]))
             unpromised += sum(error is not None and "promise" not in answer.source for answer in answers)
             seconds += sum(answer.seconds for answer in answers)
             bar.advance(names[-1], len(questions))
-    outside = {note.partition(":")[0] for note in notes}
-    if outside:
-        warn(
-            f"{len(outside)} of {counted(len(rows), 'row lies', 'rows lie')} outside the training scenes; the first:"
-            f" {notes[0]}"
-        )
-    if unpromised:
-        warn(
-            f"no error is promised in {unpromised} of {counted(len(rows), 'row')}: their mesh or their ranges differ"
-            " from the calibration scenes"
-        )
+    _tell(len(rows), outside, folded, unpromised)
     return Sweep(table, _varied(rows, table), scope.length_unit, seconds)
 
 
-def _row(values: Mapping[str, Any], answer: Answer, origin: Sequence[float]) -> dict[str, Any]:
+def _tell(rows: int, outside: Sequence[str], folded: Sequence[str], unpromised: int) -> None:
+    """Warn, once for all rows, of the ones that are in doubt: a sentence of each row outside the training, and of each
+    with elements that are turned over."""
+    if outside:
+        lie = counted(rows, "row lies", "rows lie")
+        warn(f"{len(outside)} of {lie} outside the training scenes; the first: {outside[0]}")
+    if folded:
+        warn(f"elements are turned over in {len(folded)} of {counted(rows, 'row')}; the first: {folded[0]}")
+    if unpromised:
+        warn(
+            f"no error is promised in {unpromised} of {counted(rows, 'row')}: their mesh or their ranges differ from"
+            " the calibration scenes"
+        )
+
+
+def _row(values: Mapping[str, Any], answer: Answer, origin: Sequence[float], told: Sequence[str]) -> dict[str, Any]:
+    notes = {"notes": "; ".join(told)} if told else {}  # the table is read without the warnings
     if answer.failure is not None or not len(answer.position):
-        return {**values, "failure": answer.failure or "no frame was predicted"}
-    return {**values, **answer.figures(origin)[-1]}
+        return {**values, "failure": answer.failure or "no frame was predicted", **notes}
+    return {**values, **answer.figures(origin)[-1], **notes}
 
 
 def _varied(rows: Sequence[Mapping[str, Any]], table: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:

@@ -13,11 +13,11 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 DAMPING = 0.9  # of the slope, beyond the longest trial
-SPREAD = 0.25  # the interval reaches from 1 / 1.25 to 1.25 times the expected error
+SPREAD = 0.3  # the interval reaches from 0.7 to 1.3 times the expected error
 
 
 class Forecast(NamedTuple):
-    """An expected error and an interval around it; two of four trainings that were checked ended in theirs."""
+    """An expected error and an interval around it; four of five trainings that were checked ended in theirs."""
 
     error: float
     low: float
@@ -25,17 +25,20 @@ class Forecast(NamedTuple):
 
 
 def slope(points: Sequence[tuple[int, float]]) -> float:
-    """The power by which the error falls with the steps, between the last two points (steps, error); at least 0."""
+    """The power by which the error falls with the steps, between the last two points (steps, error)."""
     (before, worse), (after, better) = points[-2:]
-    return max(0.0, math.log(worse / better) / math.log(after / before))
+    return math.log(worse / better) / math.log(after / before)
 
 
-def forecast(points: Sequence[tuple[int, float]], steps: int) -> Forecast:
-    """The error after `steps` steps.
+def forecast(points: Sequence[tuple[int, float]], steps: int) -> Forecast | None:
+    """The error after `steps` steps; None if the longest training was no better than the one before.
 
     Args:
         points: steps and error of two trainings or more, the longest one last.
     """
+    power = slope(points)
+    if power <= 0:
+        return None
     longest, error = points[-1]
-    expected = error * (steps / longest) ** (-DAMPING * slope(points))
-    return Forecast(expected, expected / (1 + SPREAD), expected * (1 + SPREAD))
+    expected = error * (steps / longest) ** (-DAMPING * power)
+    return Forecast(expected, expected * (1 - SPREAD), expected * (1 + SPREAD))

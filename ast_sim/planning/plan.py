@@ -41,7 +41,8 @@ class Plan:
         trials: in the order in which they were made; the last one has half of the training scenes, the one before it is
             the longest of the best settings.
         settings: of the training, by dotted key, where they differ from the given ones.
-        expected: the error of the network alone on validation scenes, relative to their displacement.
+        expected: the error of the network alone on validation scenes, relative to their displacement; None if the
+            longest trial was no better than the one before.
         passes: how often the training will see each of its frames.
         more_minutes, more_scenes: the share of the error that twice the minutes and twice the scenes leave, as the
             trials saw it.
@@ -53,7 +54,7 @@ class Plan:
     steps: int
     trials: tuple[Trial, ...]
     settings: Mapping[str, Any]
-    expected: Forecast
+    expected: Forecast | None
     passes: float
     more_minutes: float
     more_scenes: float
@@ -62,18 +63,25 @@ class Plan:
 
     def __str__(self) -> str:
         longest = self.trials[-2]
-        error, low, high = map(percent, self.expected)
         minutes = self.more_minutes
         scenes = self.more_scenes
         return "\n".join([
             f"take: {longest.name}",
             f"{duration(60 * self.minutes)} are {self.steps:,} steps of {measured_time(longest.seconds)}; each frame is"
             f" seen {self.passes:.2g} times",
-            f"expected error of one call of the network: {error} of the displacement ({low} to {high})",
+            self._expectation(),
             f"in the trials, twice the steps leave {percent(minutes)} of the error, twice the scenes"
             f" {percent(scenes)}: more {'minutes' if minutes < scenes else 'scenes'} help more",
             self.command,
         ])  # fmt: skip
+
+    def _expectation(self) -> str:
+        if self.expected is None:
+            own = [trial for trial in self.trials[:-1] if trial.name == self.trials[-2].name]
+            left = [f"{trial.steps:,} steps left {percent(trial.error)}" for trial in own[-2:]]
+            return f"no forecast of the error: {', '.join(left)}; plan with more minutes or more validation scenes"
+        error, low, high = map(percent, self.expected)
+        return f"expected error of one call of the network: {error} of the displacement ({low} to {high})"
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write all figures as JSON."""

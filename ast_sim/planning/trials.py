@@ -133,6 +133,8 @@ class Trials:
         if record is None or record["valid_rmse"] is None or seconds is None:
             why = "it was not validated" if record is None else record.get("failure")
             raise TrainingError(f"the trial {about} has no error: {why}; see {folder}")
+        if not record["valid_hold_still"]:
+            raise TrainingError(f"the trial {about} has no error: nothing moves in its validation scenes; see {folder}")
         error = record["valid_rmse"] / record["valid_hold_still"]
         return Trial(name, steps, scenes or self.scenes, seconds, error, folder.name)
 

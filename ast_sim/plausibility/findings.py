@@ -76,7 +76,8 @@ def _counted(number: int, what: str) -> str:
 
 
 def places(kind: str, rows: np.ndarray, points: np.ndarray | None = None) -> str:
-    """The first rows [n] as text: "elements 3, 5, 8, ..."; with `points` [n, 3] the place of the first."""
+    """The first rows [n] as text: places("elements", rows) is "elements 3, 5, 8, ...", of one row "element 3"; with
+    `points` [n, 3] the place of the first."""
     shown = ", ".join(str(row) for row in rows[:_PLACES].tolist()) + (", ..." if len(rows) > _PLACES else "")
     at = f", the first at {point(points[0])}" if points is not None and len(points) else ""
-    return f"{kind} {shown}{at}"
+    return f"{kind.removesuffix('s') if len(rows) == 1 else kind} {shown}{at}"

@@ -1,10 +1,10 @@
 """The settings and the scope of a run as files: `config.toml` and `scope.toml` for people, `run.json` to compare with.
 
 `run.json` holds the settings, the scope and the dataset that the run was started with, the checkpoint that gave its
-first weights if it starts from another run, the specification of an assembly if the dataset was made of one, and the
-SHA-256 of them all. It is written once. A reader compares the
-other two files with it, so a damaged or edited file is noticed. Each checkpoint holds the SHA-256, so a checkpoint of
-another run is noticed.
+first weights if it starts from another run, the specification of an assembly if the dataset was made of one, the hashes
+of the scenes that train and choose it (`same_motions`), and the SHA-256 of them all. It is written once. A reader
+compares the other two files with it, so a damaged or edited file is noticed. Each checkpoint holds the SHA-256, so a
+checkpoint of another run is noticed.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from __future__ import annotations
 import hashlib
 import json
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,7 @@ VERSION = 2  # in version 1 elastic forces, an input, had another Poisson's rati
 _KEYS = {"version", CONFIG, SCOPE, "data", "sha256"}
 _START = "start"  # only in a run that starts from another one
 _SPECIFICATION = "specification"  # only in a run that was trained on an assembly
+_SCENES = "scenes"  # not in older runs
 
 
 def has_config(run: Path) -> bool:
@@ -42,15 +43,18 @@ def write_config(
     data: str,
     start: Mapping[str, Any] | None = None,
     specification: Mapping[str, Any] | None = None,
+    scenes: Mapping[str, Sequence[str]] | None = None,
 ) -> None:
     """Write the three files, each whole; `data` is the dataset's fingerprint, `start` the checkpoint that gives the
-    first weights, `specification` what `AssemblySpec.describe` gave when the dataset was made.
+    first weights, `specification` what `AssemblySpec.describe` gave when the dataset was made, `scenes` the hashes of
+    the scenes by split.
 
     The settings come last: a folder with settings has the other two.
     """
     values = {"version": VERSION, CONFIG: to_values(settings), SCOPE: to_values(scope), "data": data}
     values |= {_START: dict(start)} if start else {}
     values |= {_SPECIFICATION: dict(specification)} if specification else {}
+    values |= {_SCENES: {split: " ".join(hashes) for split, hashes in scenes.items()}} if scenes else {}
     write_text(run / SCOPE, _text(scope))
     write_text(run / ORIGIN, json.dumps({**values, "sha256": _hash(values)}, indent=1) + "\n")
     write_text(run / CONFIG, _text(settings))
@@ -97,8 +101,8 @@ def read_changes(path: Path) -> dict[str, Any]:
 
 
 def read_origin(run: Path) -> dict[str, Any]:
-    """The content of `run.json`: `config.toml`, `scope.toml`, `data`, `sha256`; `start` and `specification` if there
-    are such.
+    """The content of `run.json`: `config.toml`, `scope.toml`, `data`, `sha256`; `start`, `specification` and `scenes`
+    if there are such.
 
     Raises:
         CheckpointError: the file is missing, damaged or of another version.
@@ -106,7 +110,7 @@ def read_origin(run: Path) -> dict[str, Any]:
     path = run / ORIGIN
     try:
         origin = json.loads(path.read_text(encoding="utf-8"))
-        if origin.keys() - {_START, _SPECIFICATION} != _KEYS or origin["sha256"] != _hash(origin):
+        if origin.keys() - {_START, _SPECIFICATION, _SCENES} != _KEYS or origin["sha256"] != _hash(origin):
             raise ValueError
     except OSError as error:
         raise CheckpointError(f"{path} cannot be read ({error.strerror}): {_advice(ORIGIN)}") from error

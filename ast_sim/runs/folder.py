@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ast_sim.dataset.reader import Dataset
+from ast_sim.dataset.same_motions import same_motions
 from ast_sim.models.registry import trained_model
 from ast_sim.models.simulator import Simulator
 from ast_sim.runs import checkpoint
@@ -16,7 +17,7 @@ from ast_sim.runs.config_toml import read_config, read_origin, read_scope
 from ast_sim.runs.metrics import Metrics
 from ast_sim.runs.scope import Scope
 from ast_sim.runs.train_config import RunConfig
-from ast_sim.support.errors import CheckpointError, ConfigError, warn
+from ast_sim.support.errors import CheckpointError, ConfigError, counted, warn
 
 _ANSWERS = ("effort", "valid_by_effort")  # what a validation records of answers; it is kept beside the best checkpoint
 
@@ -161,10 +162,29 @@ class RunFolder:
         if same_place and self.origin.get("data") not in (None, dataset.fingerprint()):
             warn(f"{dataset.path} holds other scenes than when {self.path} was trained on it")
 
+    def scenes(self, split: str) -> list[str]:
+        """The hashes (`same_motions`) of the scenes of "train" or "valid" that have trained or chosen the run, and the
+        run that it starts from; none in older runs."""
+        return self.origin.get("scenes", {}).get(split, "").split()
+
+    def learned(self, dataset: Dataset, split: str) -> list[int]:
+        """The numbers of the scenes of a split that have trained or chosen the run, in whatever dataset they stand now.
+        An older run knows the path and the fingerprint of its dataset alone."""
+        same_place = Path(self.settings.data).resolve() == dataset.path.resolve()
+        if split in ("train", "valid") and (same_place or self.origin.get("data") == dataset.fingerprint()):
+            return list(range(dataset.count(split)))
+        return same_motions(dataset, split, {*self.scenes("train"), *self.scenes("valid")})
+
     def warn_if_learned(self, dataset: Dataset, split: str) -> None:
-        """Warn if the run learned from the scenes of this split: its errors there are no errors in new scenes."""
+        """Warn if the run learned from scenes of this split: its errors there are no errors in new scenes."""
         if split == "train" and Path(self.settings.data) == dataset.absolute_path:
             warn(f"{self.path} learned from these scenes ({dataset.path}, split train): new ones have larger errors")
+        elif known := same_motions(dataset, split, set(self.scenes("train"))):
+            all_of_them = counted(dataset.count(split), "scene")
+            warn(
+                f"{self.path} learned from {len(known)} of {all_of_them} ({dataset.path}, split {split}; the first is"
+                f" {split}/{known[0]:06d}): new ones have larger errors"
+            )
 
     def describe(self) -> dict[str, Any]:
         """What `ast-sim info` says of a run: its settings, the checkpoint that it starts from, its checkpoints and the

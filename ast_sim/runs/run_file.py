@@ -92,7 +92,7 @@ class RunFile(RunFolder):
 
     @cached_property
     def origin(self) -> dict[str, Any]:
-        return {key: self._facts[key] for key in ("data", "specification") if key in self._facts}
+        return {key: self._facts[key] for key in ("data", "specification", "scenes") if key in self._facts}
 
     @cached_property
     def chosen(self) -> Chosen:
@@ -198,7 +198,7 @@ def write(path: Path, run: RunFolder, model: Simulator, effort: Mapping[str, Any
         "step": chosen.step,
         "answers": chosen.answers,
         "data": run.origin["data"],
-        **({"specification": run.specification} if run.specification else {}),
+        **{key: run.origin[key] for key in ("specification", "scenes") if run.origin.get(key)},
     }
     weights = {key: tensor.detach().clone().contiguous() for key, tensor in model.state_dict().items()}
     members = {

@@ -30,9 +30,10 @@ class Scope:
         spacing: mean length of the mesh edges of the deforming bodies at rest.
         held: diagonal of the box around the held nodes (the prescribed ones of the deforming bodies) at rest, as a
             share of `size`; 0 if nothing is held.
-        travel: largest distance of a prescribed node from its place in the first frame.
-        motion_low, motion_high: the lowest and the highest displacement of a prescribed node from its place in the
-            first frame, along x, y and z; along an axis that training scenes were mirrored in, either way.
+        travel: largest distance of a prescribed node from its place at rest; with inertia from its place in the first
+            frame, where such scenes start.
+        motion_low, motion_high: the lowest and the highest displacement of a prescribed node from there, along x, y and
+            z; along an axis that training scenes were mirrored in, either way.
         increment: largest displacement of a prescribed node in one frame.
         usual_increment: the median of that displacement over all frames in which one moves; 0 if none ever does.
         material_low, material_high: the lowest and the highest number of each material column.
@@ -66,6 +67,7 @@ class Scope:
         prescribed nodes move in one frame matters where `each_frame` is predicted from the one before."""
         length = f" {self.length_unit}"
         increment = max(motion.increments(scene)) if each_frame else 0.0
+        motion = whole_motion(scene, motion, self.data.dynamic)
         travel = motion.travel(scene)
         for (low, high), value, text, unit in (
             ((self.corners, self.corners), scene.elements.shape[1], "the elements have {} nodes", ""),
@@ -103,6 +105,12 @@ class Scope:
             values = np.full(scene.num_elements, numbers)[scene.deforming_elements]
             for value in (values.min(initial=limits[0]), values.max(initial=limits[1])):
                 yield limits, float(value), f"{name} of the material is {{}}", ""
+
+
+def whole_motion(scene: Scene, motion: Motion, dynamic: bool) -> Motion:
+    """The motion whose travel counts: without inertia it begins at rest, since what was prescribed before the first
+    frame counts as much as what comes after it."""
+    return motion if dynamic else motion.from_rest(scene)
 
 
 def size_of(scene: Scene) -> float:

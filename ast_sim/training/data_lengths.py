@@ -19,7 +19,7 @@ from ast_sim.plausibility.findings import Finding, refusal
 from ast_sim.plausibility.motion import negative_stress
 from ast_sim.plausibility.topology import folded_inside_out
 from ast_sim.prescribed_motion import Motion
-from ast_sim.runs.scope import Scope, edge_lengths, held_share_of, size_of, spacing_of
+from ast_sim.runs.scope import Scope, edge_lengths, held_share_of, size_of, spacing_of, whole_motion
 from ast_sim.scene import AttributeValue, NodeType
 from ast_sim.support.errors import TrainingError, warn
 
@@ -122,8 +122,9 @@ def scope_of(dataset: Dataset, data: DataFacts, mirror: Sequence[str] = ()) -> S
         moves = motion.increments(scene)
         increments += [length for length in moves if length > 0]
         sizes = (scene.num_nodes, size_of(scene), spacing_of(scene), held_share_of(scene))
-        rows.append((*sizes, motion.travel(scene), max(moves)))
-        extents.append(motion.extent(scene))
+        whole = whole_motion(scene, motion, data.dynamic)
+        rows.append((*sizes, whole.travel(scene), max(moves)))
+        extents.append(whole.extent(scene))
         if scene.material is not None:
             materials.append(scene.material[scene.deforming_elements])
     names = ("nodes", "size", "spacing", "held", "travel", "increment")

@@ -19,6 +19,7 @@ import torch
 
 from ast_sim.batches.torch_settings import usual_settings
 from ast_sim.dataset.reader import Dataset
+from ast_sim.dataset.same_motions import motion_hashes
 from ast_sim.inference.promises.known_weights import require_known_weights
 from ast_sim.inference.trained_run import Run
 from ast_sim.models.registry import build_model
@@ -202,12 +203,21 @@ def start_training(
             if saved is not None:
                 _require_same(folder, saved, resolved, source)
             elif processes.leads:
-                start = None if source is None else source.start()
                 scope = scope_of(dataset, resolved.model.data, resolved.train.mirror)
-                spec = dataset.info.generator.get("spec")
-                write_config(folder.path, resolved, scope, dataset.fingerprint(), start, spec)
+                start = None if source is None else source.start()
+                origin = (dataset.fingerprint(), start, dataset.info.generator.get("spec"))
+                write_config(folder.path, resolved, scope, *origin, _learned(dataset, resolved, source))
             with begin(config=resolved, callback=callback) as training:
                 training.profile(profile_steps) if profile_steps else training.go()
+
+
+def _learned(dataset: Dataset, config: RunConfig, source: RunFolder | None) -> dict[str, list[str]]:
+    """The hashes of the scenes that train and choose a run, by split, and the ones of the run that it starts from."""
+    used = motion_hashes(dataset, "train")[: config.train.scenes]
+    own = {"train": used, "valid": motion_hashes(dataset, "valid")}
+    if source is None:
+        return own
+    return {split: list(dict.fromkeys([*hashes, *source.scenes(split)])) for split, hashes in own.items()}
 
 
 def train_along() -> None:

@@ -1,17 +1,20 @@
 """Extremes: what the run that comes with the package makes of plates that no training had in mind.
 
 `python -m benchmarks.robustness.extremes` asks for changed plates: moved, turned, scaled, of other meshes, with other
-motions, with rounded weights, by one call and with Newton steps. Where the right answer is known, the error stands
-beside it: by the solver, or since the change must not change the answer. It writes benchmarks/results/extremes.json and
-docs/results/extremes.md. The scenes lie in `--folder`.
+motions, with rounded weights, by one call and with Newton steps. The other models of the package are trained for a few
+minutes and answer the same questions by one call. Where the right answer is known, the error stands beside it: by the
+solver, or since the change must not change the answer. It writes benchmarks/results/extremes.json and
+docs/results/extremes.md. Scenes and runs lie in `--folder`; a second call goes on with what is there.
 """
 
 from __future__ import annotations
 
 import argparse
+import resource
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -23,12 +26,17 @@ from ast_sim.inference.quantities.relative_errors import rms
 from ast_sim.support.disk import write_json, write_text
 from ast_sim.support.errors import AstSimError
 from ast_sim.support.provenance import provenance
+from benchmarks.studies.phrases import table_head, table_line
 
 RESULTS = Path(__file__).parents[1] / "results" / "extremes.json"
 PAGE = Path(__file__).parents[2] / "docs" / "results" / "extremes.md"
 PLATES = {"train": 0, "valid": 0, "test": 1, "frames": 41, "keep": (24,), "seed": 7}
 SIZES = (80, 100, 200, 400, 1600, 6400)
 EFFORTS = {"one call": ast_sim.Effort(), "Newton steps": ast_sim.Effort(0, 10)}
+OTHERS = {"transolver": "Transolver", "mgn": "MeshGraphNets", "bsms": "BSMS-GNN", "hcmt": "HCMT"}
+TRAINING = {"family": "deforming_plate", "nodes": 400, "frames": 41, "keep": (14, 24, 34), "train": 200, "valid": 10}
+STEPS = 400
+MEMORY = 16 * 10**9  # bytes of address space that a question may take
 
 
 @dataclass(frozen=True)
@@ -144,9 +152,26 @@ def _rounded(run: ast_sim.Run) -> None:
         values.data = values.data.bfloat16().to(values.dtype)
 
 
-def outcome_of(case: Case, effort: ast_sim.Effort) -> dict[str, Any]:
-    """What became of a question."""
-    run = ast_sim.example_run("plates")
+def _trained(model: str, folder: Path) -> Path:
+    """The folder of a short training of another model."""
+    data = ast_sim.generate(out=folder / "training.h5", test=0, **TRAINING, progress=False).path
+    out = folder / f"run_{model}"
+    return ast_sim.train(data, out, model=model, steps=STEPS, mirror=("x", "y"), resume=True, progress=False).path
+
+
+@contextmanager
+def _memory_limit(most: int) -> Iterator[None]:
+    """In the block this process may take `most` bytes of address space."""
+    usual, hard = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (most, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, (usual, hard))
+
+
+def outcome_of(run: ast_sim.Run, case: Case, effort: ast_sim.Effort) -> dict[str, Any]:
+    """What became of a question to a run that nothing has prepared yet."""
     case.prepare(run)
     began = time.process_time()
     with warnings.catch_warnings(record=True) as caught:
@@ -156,7 +181,8 @@ def outcome_of(case: Case, effort: ast_sim.Effort) -> dict[str, Any]:
         except AstSimError as error:
             return {"outcome": "refused", "words": str(error)}
         except Exception as error:
-            return {"outcome": "error", "words": f"{type(error).__name__}: {error}"}
+            full = isinstance(error, MemoryError) or "can't allocate memory" in str(error)
+            return {"outcome": "no memory" if full else "error", "words": f"{type(error).__name__}: {error}"}
     told = [str(one.message).partition(": ")[2] for one in caught]
     figures: dict[str, Any] = {"seconds": time.process_time() - began, "words": "; ".join(told)}
     if answer.failure is not None:
@@ -173,7 +199,7 @@ def outcome_of(case: Case, effort: ast_sim.Effort) -> dict[str, Any]:
 
 def page(results: dict[str, Any]) -> str:
     """The page of all cases."""
-    lines = [_INTRODUCTION.format(processor=results["processor"]).rstrip()]
+    lines = [_INTRODUCTION.format(processor=results["processor"], memory=MEMORY / 1e9).rstrip()]
     for group in dict.fromkeys(case["group"] for case in results["cases"]):
         lines += ["", f"## {group.capitalize()}", ""]
         lines += ["| question | by | outcome | error | turned over | depth | seconds | in words |"]
@@ -181,6 +207,8 @@ def page(results: dict[str, Any]) -> str:
         for case in results["cases"]:
             if case["group"] == group:
                 lines += [_line(case["title"], effort, case[effort]) for effort in EFFORTS]
+    lines += ["", *_OTHERS.splitlines(), "", *table_head(["question", *OTHERS.values()], texts=1)]
+    lines += [table_line([case["title"], *(_short(case[name]) for name in OTHERS)]) for case in results["cases"]]
     return "\n".join(lines) + "\n"
 
 
@@ -190,11 +218,26 @@ Made by `python -m benchmarks.robustness.extremes` from `benchmarks/results/extr
 
 The run of plates that comes with the package predicts the last frame of plates that are unlike its training, on an
 {processor}. "Answered" is an answer without a word, "warned" an answer with a warning, "failed" an
-answer that ends early and says why, "refused" a question that is not answered, "error" a fault of ours. The
-error is relative to the displacement, where the right answer is known: from the solver, or from the plate as it is,
-since the change should change nothing else. "Turned over" counts elements of the plate that are inside out, "depth" is
-the deepest node inside another body, in metres. Seconds are processor time of one question, the first of its kind.
+answer that ends early and says why, "refused" a question that is not answered, "no memory" one that takes more than
+{memory:.0f} GB, "error" a fault of ours. The error is relative to the displacement, where the right answer is known:
+from the solver, or from the plate as it is, since the change should change nothing else. "Turned over" counts elements
+of the plate that are inside out, "depth" is the deepest node inside another body, in metres. Seconds are processor time
+of one question, the first of its kind.
 """
+
+
+_OTHERS = f"""## Other models
+
+The other models of the package, each after {STEPS} training steps on {TRAINING["train"]} plates of 400 nodes, by one
+call. So their errors are large; the table is about what is answered, told and refused. What each says is in the JSON.
+"""
+
+
+def _short(row: dict[str, Any]) -> str:
+    """An outcome with its error and the number of elements that are turned over."""
+    error = None if row.get("error") is None else f"{100 * row['error']:.3g} %"
+    turned = f"{row['turned_over']:.0f} turned over" if row.get("turned_over") else None
+    return ", ".join(text for text in (row["outcome"], error, turned) if text)
 
 
 def _line(title: str, effort: str, row: dict[str, Any]) -> str:
@@ -209,14 +252,22 @@ def _line(title: str, effort: str, row: dict[str, Any]) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--folder", type=Path, default=Path("build/extremes"), help="scenes (default: build/extremes)")
+    parser.add_argument(
+        "--folder", type=Path, default=Path("build/extremes"), help="scenes and runs (default: build/extremes)"
+    )
     folder = parser.parse_args(arguments).folder
     import torch  # after ast_sim, which says how its threads wait
 
     torch.set_num_threads(1)
+    others = {model: _trained(model, folder) for model in OTHERS}
     cases = []
     for case in _cases(folder):
-        outcomes = {name: outcome_of(case, effort) for name, effort in EFFORTS.items()}
+        with _memory_limit(MEMORY):
+            shipped = {
+                name: outcome_of(ast_sim.example_run("plates"), case, effort) for name, effort in EFFORTS.items()
+            }
+            others_say = {name: outcome_of(ast_sim.Run(path), case, ast_sim.Effort()) for name, path in others.items()}
+        outcomes = shipped | others_say
         cases.append({"group": case.group, "title": case.title, **outcomes})
         print(case.title, {name: row["outcome"] for name, row in outcomes.items()}, flush=True)
     efforts = {name: asdict(effort) for name, effort in EFFORTS.items()}

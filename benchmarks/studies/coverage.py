@@ -96,7 +96,7 @@ def measured(name: str, folder: Path) -> dict[str, Any]:
         rows = [row for effort in calibration.efforts for row in bands(run, calibrating, truths, effort)]
         promised = promises(run, truths)
         ordinary = [(truth.scene, truth.position) for truth in truths]
-        kinds = {"fresh scenes": ordinary, **strange(name, truths[:STRANGE], folder)}
+        kinds = {"fresh scenes": ordinary, **strange(name, run, truths[:STRANGE], folder)}
         told = {kind: unusual(run, questions) for kind, questions in kinds.items()}
     known = {"title": ROWS[name].title, "calibration_scenes": calibration.scenes, "spacing": list(calibration.spacing)}
     origin = provenance(f"python -m benchmarks.studies.coverage {name}")
@@ -164,9 +164,15 @@ def _is_unlike(answer: ast_sim.Answer) -> bool:
     return answer.p_value is not None and answer.p_value <= UNUSUAL
 
 
-def strange(name: str, truths: Sequence[ast_sim.Trajectory], folder: Path) -> dict[str, list[Question]]:
-    """Questions to the run of a row, by what is strange about them."""
-    kinds = {"twice the travel": [(one.scene, 2 * one.position - one.position[:1]) for one in truths]}
+def strange(
+    name: str, run: ast_sim.Run, truths: Sequence[ast_sim.Trajectory], folder: Path
+) -> dict[str, list[Question]]:
+    """Questions to the run of a row, by what is strange about them. Twice a short travel may be an ordinary one, so
+    those that are farther than any of the training are counted by themselves, too."""
+    doubled = [(one.scene, 2 * one.position - one.position[:1]) for one in truths]
+    longest = run.scope.travel[1]
+    farther = [(scene, motion) for scene, motion in doubled if ast_sim.Motion(motion).travel(scene) > longest]
+    kinds = {"twice the travel": doubled, "of these: farther than any scene of the training": farther}
     if truths[0].scene.material is not None:
         kinds["three times the stiffness"] = [(_stiffer(one.scene), one.position) for one in truths]
     if name == "plates":

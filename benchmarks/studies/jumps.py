@@ -234,7 +234,8 @@ Made by `python -m benchmarks.studies.jumps` from `benchmarks/results/jumps.json
 
 The deepest frame is the one in which a scene is deformed most. Its error is the root mean square of the error over the
 free nodes, divided by the root mean square of their displacement; tables have the mean over the test scenes and its
-standard error. "Training scenes" has the error on scenes of the training. "Minutes" are the steps times the median time
+standard error. "One call" has the error of the network alone, "error" with the corrections and Newton steps of
+"effort", and "training scenes" the same on scenes of the training. "Minutes" are the steps times the median time
 of a step, on one thread; other work on the machine made some rows slower, so rows with equal steps differ. An "answer"
 is the median time from the question to positions and stress, for a scene alone, with all that is prepared for its mesh.
 Rows without a solver were measured beside other work: their errors count, their times say little.
@@ -255,8 +256,9 @@ the scenes in which the solver was run (ten; five pairs of parts), with its stan
 
 
 def _table(shown: Sequence[MeasuredRow]) -> list[str]:
-    head = ["scenes", "trained", "minutes", "effort", "error", "training scenes", "answer", "solver", "cheapest"]
-    lines = ["| " + " | ".join(head) + " |", "| --- | --- | ---: | --- |" + " ---: |" * (len(head) - 4)]
+    head = ["scenes", "trained", "minutes", "one call", "effort", "error", "training scenes", "answer"]
+    head += ["solver", "cheapest"]
+    lines = ["| " + " | ".join(head) + " |", "| --- | --- | ---: | ---: | --- |" + " ---: |" * (len(head) - 5)]
     for one in shown:
         scenes = one.deepest.scenes
         errors = [scene.relative_error for scene in scenes]
@@ -265,8 +267,9 @@ def _table(shown: Sequence[MeasuredRow]) -> list[str]:
             one.row.title,
             _trained_text(one.row),
             f"{one.minutes:.0f}",
+            mean_percent(one.dial[0].relative_error) if one.dial else "-",
             one.effort.text if one.row.model_settings.get("jumps", True) else "every frame",
-            _percent(errors),
+            mean_percent(errors),
             f"{100 * one.training_scenes:.1f} %",
             f"{1000 * np.median(seconds):.0f} ms",
             beside_solver(scenes, [0.0] * len(errors), seconds),
@@ -281,10 +284,12 @@ def _trained_text(row: Row) -> str:
     return f"{row.train:,} scenes, {row.steps:,} steps{together}"
 
 
-def _percent(errors: list[float | None]) -> str:
+def mean_percent(errors: list[float | None]) -> str:
+    """The mean with its standard error, as in "2.8 ± 0.2 %", and how many are missing."""
     known = [100 * error for error in errors if error is not None]
     failed = f", {len(errors) - len(known)} failed" if len(known) < len(errors) else ""
-    return f"{np.mean(known):.1f} ± {np.std(known) / len(known) ** 0.5:.1f} %{failed}"
+    digits = 1 if np.mean(known) >= 1 else 2
+    return f"{np.mean(known):.{digits}f} ± {np.std(known) / len(known) ** 0.5:.{digits}f} %{failed}"
 
 
 def _section(one: MeasuredRow) -> list[str]:
@@ -308,7 +313,7 @@ def _section(one: MeasuredRow) -> list[str]:
         lines.append("| " + " | ".join([
             f"{turned.effort.corrections}",
             f"up to {turned.effort.newton_steps}" if turned.effort.newton_steps else "0",
-            _percent(turned.relative_error),
+            mean_percent(turned.relative_error),
             "-" if turned.stress_share is None else f"{turned.stress_share:.2f}",
             f"{1000 * np.median(turned.seconds):.0f} ms",
             beside_solver(deepest.scenes, turned.relative_error, turned.seconds),

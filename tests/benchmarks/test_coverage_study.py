@@ -58,6 +58,10 @@ def test_a_run_is_calibrated_and_asked_for_fresh_and_strange_scenes(small):
     )
     told = result["told"]
     assert told["fresh scenes"]["questions"] == told["twice the travel"]["questions"] == FRESH
+    moved = [2 * np.linalg.norm(truth.position - truth.position[0], axis=2) for truth in truths]
+    doubled = [far[:, truth.scene.prescribed].max() for far, truth in zip(moved, truths, strict=True)]
+    farther = told["of these: farther than any scene of the training"]
+    assert farther["questions"] == sum(far > run.scope.travel[1] for far in doubled) >= farther["outside"] > 0
     assert told["held by nothing"]["told"] <= FRESH and told["a beam in place of a plate"]["outside"] == FRESH
     page = coverage.PAGE.read_text()
     assert "## Plates, 400 nodes" in page and f"| displacement | {held} of {row['fresh_scenes']} |" in page

@@ -44,6 +44,8 @@ def test_a_row_is_trained_measured_and_shown_and_found_again(small):
     assert walk.effort == Effort() and walk.deepest.after_calls == () and walk.dial == []
     text = jumps.PAGE.read_text()
     assert f"{100 * row.deepest.relative_error:.1f} ±" in text and "times as long" in text and "every frame" in text
+    calls = [line.split(" | ")[3] for line in text.splitlines() if line.startswith(f"| {row.row.title} | ")]
+    assert calls[0].startswith(f"{100 * row.deepest.after_calls[0]:.1f} ± ") and calls[1] == "-"
     assert text.count("\n## ") == 2 and "Worst: test/" in text
     jumps.main(["walk", "--folder", str(small / "data")])  # nothing is trained again
     again = jumps.MeasuredRow.from_json(json.loads(jumps.RESULTS.read_text())["walk"])

@@ -278,14 +278,25 @@ def test_a_result_stands_for_the_same_entry_and_study(tmp_path):
 
 
 def test_a_failure_is_tried_again(tmp_path, monkeypatch):
-    data = toy.write(tmp_path / "toy.h5")
-    plan, entries = read(written(tmp_path, TOML.replace("toy.h5", str(data))))
-    with monkeypatch.context() as patch:
-        patch.setenv("AST_SIM_BACKEND", "broken")
-        (found,) = study.conduct(plan, entries, data, tmp_path / "runs", 1, {})
-    assert "AST_SIM_BACKEND=broken: choose c or torch" in found["ast"]["runs"][0]["failed"]
-    (found,) = study.conduct(plan, entries, data, tmp_path / "runs", 1, {})
-    assert "measured" in found["ast"]["runs"][0]
+    """A training that fails, then a measurement that fails: what has been done stands, what failed is done again."""
+    plan, entries = read(written(tmp_path, TOML))
+    job = study_run.Job(plan, "ast", entries["ast"], 0, 1e-3, 1, tmp_path / "toy.h5", tmp_path / "runs")
+    study_run.keep_speed(job, {"seconds_per_step": 0.5, "batch": 4})
+    codes, begun = [1, 0, 1, 0], []
+
+    def python(job, words, log):
+        begun.append(words[1])
+        (job.folder / log).write_text("it began\nit broke\n")
+        (job.folder / "measured.json").write_text('{"horizons": 3}')
+        return codes[len(begun) - 1], 10**6
+
+    monkeypatch.setattr(study_run, "_python", python)
+    assert study_run.run(job)["failed"] == "it broke" and not (job.folder / "trained.json").exists()
+    assert study_run.run(job)["failed"] == "it broke" and not (job.folder / "result.json").exists()
+    record = study_run.run(job)
+    assert "failed" not in record and record["measured"] == {"horizons": 3} and record["steps"] == 4
+    assert study_run.run(job) == record
+    assert begun == ["ast_sim.cli", "ast_sim.cli", "benchmarks.studies.measure", "benchmarks.studies.measure"]
 
 
 def page(folder, found, summary) -> None:

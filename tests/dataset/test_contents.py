@@ -46,7 +46,7 @@ def test_frames_that_stop_dead_are_told_where_bodies_have_inertia(tmp_path, inte
     frames[4, 5] += np.float32(0.1)
     path = write(tmp_path / "d.h5", {"train": [Trajectory(block(2, 1, 1), frames)]}, integration=integration)
     wrong = [(one["what"], one["count"], one["places"]) for one in describe_dataset(path)["looks_wrong"]]
-    assert wrong.count(("frames that repeat", 1, "frames 3")) == told == sum("repeat" in what for what, *_ in wrong)
+    assert wrong.count(("frames that repeat", 1, "frame 3")) == told == sum("repeat" in what for what, *_ in wrong)
 
 
 def test_elements_that_all_lie_at_one_point_are_told(tmp_path):

@@ -3,9 +3,11 @@
 import json
 import re
 from pathlib import Path
-from statistics import median
+from statistics import mean, median
 
-from benchmarks.studies import clip_page, example_meshes
+import pytest
+
+from benchmarks.studies import clip_page, example_meshes, jumps
 from benchmarks.studies.clip_outcome import Outcome, errors
 from benchmarks.studies.clip_variants import FINER
 
@@ -128,6 +130,35 @@ def test_newton_steps_end_near_the_solver():
     of_scenes = [scene["relative_error"] for scene in results("jumps")["plates400_long"]["deepest"]["scenes"]]
     shown = (float(f"{100 * median(of_scenes):.1g}"), len(of_scenes))
     assert numbers(r"\(([\d.]+) % off in the median of (\d+) plates\)", SCENES) == shown
+
+
+def test_the_run_that_comes_with_the_package():
+    row = results("jumps")["plates400_long"]
+    errors = (row["dial"][0]["relative_error"], [scene["relative_error"] for scene in row["deepest"]["scenes"]])
+    shown = tuple(float(f"{100 * mean(of_scenes):.2g}") for of_scenes in errors)
+    assert numbers(r"has ([\d.]+) and ([\d.]+) %, but in (\d+) other plates", README) == (*shown, len(errors[0]))
+
+
+@pytest.mark.parametrize(("product", "title"), [("bumper", "Bumper, sec"), ("snap hook", "Snap hook, sec")])
+def test_the_products(product, title):
+    """README's table has the figures of the page, which is made from the results."""
+    page = (ROOT / "docs" / "results" / "assembly.md").read_text(encoding="utf-8")
+    cells = [line.strip("| ").split(" | ") for line in page.splitlines() if line.startswith(f"| {title}")][0]
+    solved, trained = numbers(r"\(([\d.]+) min\)", cells[1]) + numbers(r"^(\d+)$", cells[2])
+    error, force, seconds, ratio = cells[4], cells[5], cells[7], cells[9].split(", ")[1].removesuffix(" as long")
+    (line,) = re.findall(rf"^\| {product}, [^|]*? \| (.*) \|$", README, re.MULTILINE)
+    assert line.split(" | ") == [f"{solved + trained:.0f} minutes", error, force, seconds, ratio]
+
+
+@pytest.mark.parametrize(
+    ("row", "scenes"),
+    [("plates400_long", "plates of 400 nodes"), ("plates1300", "plates of 1,300 nodes"), ("parts400_long", "pairs of")],
+)
+def test_what_a_training_leads_to(row, scenes):
+    dial = {(one["effort"]["corrections"], one["effort"]["newton_steps"]): one for one in results("jumps")[row]["dial"]}
+    shown = [jumps.mean_percent(dial[0, steps]["relative_error"]) for steps in (0, 1, 10)]
+    (line,) = re.findall(rf"^\| {scenes}[^|]*?training steps \| (.*) \|$", README, re.MULTILINE)
+    assert line.split(" | ") == shown
 
 
 def test_random_files_of_many_programs():

@@ -69,11 +69,11 @@ def test_what_does_not_change_the_mesh_leaves_it_as_it_is(tmp_path, lines):
                 "LINE, 1., 2.",
                 "*Surface, type=Revolution, name=B",
             ],
-            "rigid surfaces without elements are left out: Punch, B; a tool needs a mesh",
+            "2 rigid surfaces without elements are left out: Punch, B; a tool needs a mesh",
         ),
         (
             ["*RIGID SURFACE, TYPE=SEGMENTS", "START, 0., 2."],
-            "rigid surfaces without elements are left out: of line 12",
+            "1 rigid surface without elements is left out: of line 12",
         ),
         (["*SURFACE, TYPE=ELEMENT, NAME=Top", "ALL, S2"], None),
     ],

@@ -270,7 +270,7 @@ WRONG_RECORDS = {
     "a frame less": (changed("world_pos", lambda a: a[:-1]), r"mesh_pos has the shape \[24, 3\], must be \[21, any\]"),
     "a number less": (
         changed("world_pos", lambda a: a.ravel()[:-1]),
-        r"world_pos has 2300 bytes; meta.json says float32 \[8, -1, 3\], a multiple of 96 bytes",
+        r"world_pos has 2,300 bytes; meta.json says float32 \[8, -1, 3\], a multiple of 96 bytes",
     ),
     "half a cell": (changed("cells", lambda a: a.ravel()[:-1]), "cells has 380 bytes; .* a multiple of 16 bytes"),
 }

@@ -89,15 +89,15 @@ def grid(number, point, system=""):
     return f"{'GRID':8}{number:8}{system:>8}" + "".join(f"{float(x):8.3f}" for x in point) + "\n"
 
 
-def card(name, nodes, end):
+def card(name, nodes, end, number=1):
     """A card of an element, in fields of eight characters; `end` is what stands at the end of lines that go on."""
-    fields = [f"{text:>8}" for text in (1, 1, *nodes)]
+    fields = [f"{text:>8}" for text in (number, 1, *nodes)]
     lines = ["".join(fields[at : at + 8]) for at in range(0, len(fields), 8)]
     return f"{name:8}" + f"{end}\n        ".join(lines) + "\n"
 
 
 GRIDS = "".join(grid(1 + row, point) for row, point in enumerate(POINTS))
-WHOLE = GRIDS + "".join(card("CTETRA", 1 + cell, "") for cell in CUBE.elements)
+WHOLE = GRIDS + "".join(card("CTETRA", 1 + cell, "", 1 + row) for row, cell in enumerate(CUBE.elements))
 
 
 def nastran(folder, text):
@@ -137,10 +137,11 @@ def test_cards_of_nastran_that_are_no_part_of_a_mesh_are_told(tmp_path):
     more = "RBE2,7,1,123456,2,3\nCONM2,8,1,,1.\nconm2*  9\n*\nCBUSH,9,1,1,2\nRBE3    11\nMAT1,1,2.1e5,,0.3\nPBUSH,1\n"
     (tmp_path / "more.inc").write_text(more)
     for text in (WHOLE + more, WHOLE + "INCLUDE 'more.inc'\n"):
-        told = "cards that are no part of a mesh are left out: 1 CBUSH, 2 CONM2, 1 RBE2, 1 RBE3"
+        told = "5 cards that are no part of a mesh are left out: 1 CBUSH, 2 CONM2, 1 RBE2, 1 RBE3"
         assert told in nastran(tmp_path, text).notes
+    assert "1 card that is no part of a mesh is left out: 1 MPC" in nastran(tmp_path, WHOLE + "MPC,3,1,1,1.\n").notes
     (tmp_path / "b.bdf").write_text(f"SOL 101\nCEND\nMPC = 3\nBEGIN BULK\n{WHOLE}ENDDATA\nRBE2,7,1,123456,2,3\n")
-    assert not any("cards" in note for note in read_mesh(tmp_path / "b.bdf").notes)
+    assert not any("card" in note for note in read_mesh(tmp_path / "b.bdf").notes)
 
 
 @pytest.mark.parametrize("end", [" " * 8, "+       ", "", "+A1"])
@@ -248,6 +249,98 @@ def test_decks_of_nastran_include_others(tmp_path):
 def test_decks_of_nastran_that_lack_something_are_refused(tmp_path, text, cause):
     with pytest.raises(DatasetError, match=f"a.bdf: .*{cause}"):
         nastran(tmp_path, text)
+
+
+TETRAHEDRON = "CTETRA,7,1,1,2,4,8\n"
+
+
+@pytest.mark.parametrize(
+    ("again", "told"),
+    [
+        (TETRAHEDRON, None),  # as in a file that is included twice
+        ("ctetra, 007, 01, 01, 02, 04, 08\n", None),
+        (TETRAHEDRON.replace("CTETRA,7", "CTETRA,8"), None),
+        ("CTETRA,7,1,1,2,4,6\n", "CTETRA 7"),  # of other nodes
+        ("CTETRA,7,1,2,1,4,8\n", "CTETRA 7"),  # in another order
+        ("CTETRA,7,3,1,2,4,8\n", "CTETRA 7"),  # of another property
+        ("CTETRA,7,1,1,2,4,8,3,5\n,6,7,1,2\n", "CTETRA 7"),  # with middles
+        ("CHEXA,7,1,1,2,4,3,5,6,\n,8,7\n", ""),  # Nastran takes both
+        ("CTRIA3,7,1,1,2,4\n", ""),
+    ],
+)
+def test_two_elements_of_a_kind_and_one_number_are_refused_unless_they_are_copies(tmp_path, again, told):
+    lines = r"\(line 12 and line 13 of more.inc\): leave one out, or give it another number"
+    (tmp_path / "more.inc").write_text("$ more\n" * (12 if told else 1) + again)
+    if told:
+        with pytest.raises(DatasetError, match=f"a.bdf: {told} stands twice, with different fields {lines}"):
+            nastran(tmp_path, f"{GRIDS}{TETRAHEDRON}INCLUDE 'more.inc'\n")
+        return
+    mesh = nastran(tmp_path, f"{GRIDS}{TETRAHEDRON}INCLUDE 'more.inc'\n")
+    assert len(mesh.elements) == (6 if "CHEXA" in again else 0) + 1
+    assert ("1 element that stands in the file twice is taken once" in mesh.notes) == (told is None)
+
+
+def test_an_element_without_a_number_is_refused(tmp_path):
+    with pytest.raises(DatasetError, match=r"a.bdf: CTETRA \(line 12\) has the number ''; must be a whole number"):
+        nastran(tmp_path, GRIDS + TETRAHEDRON.replace("7", ""))
+
+
+SYSTEM = "CORD2R         5       0     0.0     0.0     0.0     0.0     0.0     1.0\n             1.0     0.0     0.0\n"
+HALVES = "".join(f"GRID,{1 + row},,{x / 2},{y / 2},{z / 2}\n" for row, (x, y, z) in enumerate(POINTS.tolist()))
+SHORT = HALVES.replace(".0", "")
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        (GRIDS.replace(".", ","), 4),
+        (GRIDS.replace("1.000", "1,000"), 5),
+        (WIDE.replace(".", ","), 4),
+        (WIDE.replace("               1.0\n", "               1,0\n"), 7),  # in the second line of a card
+        (SYSTEM.replace(".", ",") + GRIDS, 4),
+        (SYSTEM.replace("     1.0     0.0     0.0\n", "     1,0     0.0     0.0\n") + GRIDS, 5),
+        (GRIDS + card("CTRIA3", [1, 2, 4, "30,0"], "", 8), 12),
+    ],
+)
+def test_a_decimal_comma_in_a_field_of_columns_of_nastran_is_told(tmp_path, text, line):
+    """The line would be taken for one between commas, and its card for another or none."""
+    (tmp_path / "a.bdf").write_text(f"SOL 101\nCEND\nBEGIN BULK\n{text}{TETRAHEDRON}ENDDATA\n")
+    told = rf"a.bdf: line {line} has a comma in a field of 8 or 16 characters: write decimal points"
+    with pytest.raises(DatasetError, match=told):
+        read_mesh(tmp_path / "a.bdf")
+
+
+FLAT_HALVES = "".join(f"GRID,{1 + row},,{x},{y},{z / 2}\n" for row, (x, y, z) in enumerate(POINTS.tolist()))
+
+
+@pytest.mark.parametrize("points", [HALVES, SHORT, HALVES.replace(",0.5", ",-0.5"), FLAT_HALVES])
+def test_decimal_commas_between_commas_are_told(tmp_path, points):
+    """Each number becomes two, and three coordinates six fields of a GRID; a zero may be written without a comma."""
+    told = (
+        r"a.bdf: the coordinates .* of GRID \d \(line \d+\) are whole numbers, followed by .*: are the commas decimal"
+    )
+    with pytest.raises(DatasetError, match=told):
+        nastran(tmp_path, points.replace(".", ",") + TETRAHEDRON)
+    assert len(nastran(tmp_path, points + TETRAHEDRON).elements) == 1
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "MAT1           7  2,1+5             0,3\n" + GRIDS,  # of cards that are not read
+        "TITLE = A bar, held\nSUBCASE 1\n  LABEL = one, two\n" + GRIDS,
+        "  " + PADDED.replace("\n", "\n  "),
+        PADDED + "CHEXA,9,1,1,2,4,3,5,6,+1\n+1,8,7,,\n",
+        PADDED + "CHEXA,9,1,1,2,4,3,5,6\n        ,8,7\n",
+        "".join(f"GRID,{1 + row},0,{x:g},{y:g},{z:g},0,0,0\n" for row, (x, y, z) in enumerate(POINTS.tolist())),
+        "".join(f"GRID,{1 + row},,{x:g},{y:g},{z:g},-1,123\n" for row, (x, y, z) in enumerate(POINTS.tolist())),
+        SYSTEM + "".join(f"GRID,{1 + row},,{x:g},{y:g},{z:g},5\n" for row, (x, y, z) in enumerate(POINTS.tolist())),
+    ],
+)
+def test_other_commas_of_nastran_are_no_decimal_ones(tmp_path, text):
+    (tmp_path / "a.bdf").write_text(f"{text}{TETRAHEDRON}ENDDATA\n")
+    mesh = read_mesh(tmp_path / "a.bdf")
+    assert mesh.points.tolist() == POINTS.tolist() and len(mesh.elements) == 1 + 6 * ("CHEXA" in text)
 
 
 @pytest.mark.parametrize(("name", "content"), [("a.off", "OFF\n"), ("a.off", ""), ("a.ply", "ply\nformat ascii 1.0\n")])

@@ -53,7 +53,7 @@ def test_displacements_from_the_frame_before_are_told(travel, first):
 
 
 def test_the_frames_are_named():
-    assert told(from_frame_before(displacements(EVEN))) == ["frames 9"]
+    assert told(from_frame_before(displacements(EVEN))) == ["frame 9"]
 
 
 @pytest.mark.parametrize(

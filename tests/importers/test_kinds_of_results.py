@@ -188,7 +188,7 @@ def test_times_that_ascend_by_rounding_and_sets_are_told(tmp_path):
     text = path.read_text().replace('"1.5"', '"0.5000000001"')
     path.write_text(text.replace("</Topology>", '</Topology><Set Name="low" SetType="Node"/>', 1))
     notes = read_series(path, FieldNames(handle="0:zmin,zmax")).attributes["notes"]
-    assert "sets are not read: low" in notes
+    assert "1 set is not read: low" in notes
     assert "the times of frames 0 and the next differ by rounding alone: is one off?" in notes
 
 

@@ -198,5 +198,5 @@ def test_fields_may_be_on_a_part_of_the_mesh(tmp_path, nodes, cells):
 
 def test_fields_with_several_values_in_a_cell_are_left_out(tmp_path):
     mesh = read_mesh(write_with_fields(tmp_path / "a.med", several=True))
-    assert "fields with several values in a cell are left out: 'inner'" in mesh.notes
+    assert "1 field with several values in a cell is left out: 'inner'" in mesh.notes
     assert "inner" not in mesh.fields["cell"] and "young" in mesh.fields["cell"]

@@ -137,7 +137,7 @@ def test_remarks_and_fields_of_whole_grids_are_left_out(tmp_path):
     path.write_text(path.read_text().replace('"Temporal">', f'"Temporal">{remark}'))
     require_right(path)
     notes = read_series(path, FieldNames(handle="0:zmin")).attributes["notes"]
-    assert "fields with one value for the whole grid are left out: 'dt'" in notes
+    assert "1 field with one value for the whole grid is left out: 'dt'" in notes
 
 
 SHARED = (

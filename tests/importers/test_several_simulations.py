@@ -71,9 +71,9 @@ def test_a_poissons_ratio_that_cannot_be_one_is_told(tmp_path, poisson, told_of)
 @pytest.mark.parametrize(
     ("order", "places"),
     [
-        ((0, 1, 1, 2), ["frames 2"]),  # a pause
+        ((0, 1, 1, 2), ["frame 2"]),  # a pause
         ((0, 1, 2, 2, 2), ["frames 3, 4"]),  # a hold at the end
-        ((0, 0, 1, 2), ["frames 1"]),
+        ((0, 0, 1, 2), ["frame 1"]),
         ((0, 0, 1, 1, 2, 2, 1, 1), ["frames 1, 3, 5, ..."]),  # each one twice
         ((0, 1, 0, 1, 2), []),  # there and back: no frame is the one before
     ],

@@ -100,7 +100,7 @@ def test_points_and_cells_are_the_ones_of_the_file(tmp_path, name, text):
     else:
         assert groups == {"soft part": [0, 1, 2, 3]}
     assert mesh.notes == (
-        ["1 points within curved elements are left out: the corners are taken"] if "_P2" in text else []
+        ["1 point within curved elements is left out: the corners are taken"] if "_P2" in text else []
     )
 
 

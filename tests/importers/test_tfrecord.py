@@ -62,8 +62,8 @@ FILES = {
     "half a checksum": (frame(b"payload")[:-1], "it declares 7 bytes, but 10 are left"),
     "another payload": (frame(b"payload").replace(b"pay", b"pax"), "the checksum of its 7 bytes does not fit"),
     "another checksum": (frame(b"payload")[:-1] + b"!", "the checksum of its 7 bytes does not fit"),
-    "2^63": (header(1 << 63), "it declares 9223372036854775808 bytes, but 0 are left"),
-    "2^64 - 1": (header((1 << 64) - 1) + bytes(100), "it declares 18446744073709551615 bytes, but 100 are left"),
+    "2^63": (header(1 << 63), "it declares 9,223,372,036,854,775,808 bytes, but 0 are left"),
+    "2^64 - 1": (header((1 << 64) - 1) + bytes(100), "it declares 18,446,744,073,709,551,615 bytes, but 100 are left"),
     "one too many": (header(6) + bytes(9), "it declares 6 bytes, but 9 are left"),
 }
 
@@ -85,7 +85,9 @@ def test_a_file_that_shrinks_while_it_is_read(tmp_path):
     records = read_records(path)
     next(records)
     path.write_bytes(whole[:150_000])
-    with pytest.raises(DatasetError, match="record 1 at byte 100016: its payload has 100000 bytes, but 49972 are left"):
+    with pytest.raises(
+        DatasetError, match="record 1 at byte 100016: its payload has 100,000 bytes, but 49,972 are left"
+    ):
         next(records)
 
 
@@ -123,12 +125,15 @@ MESSAGES = {
     "another field": (field(2, b""), "Example has a field 2 of wire type 2"),
     "field 0": (b"\x02\x00", "Example has a field 0 of wire type 2"),
     "too long": (b"\x0a\x05abcd", "field 1 of Example at byte 0 of the record declares 5 bytes, but 4 are left"),
-    "2^63": (b"\x0a" + varint(1 << 63), "declares 9223372036854775808 bytes, but 0 are left"),
+    "2^63": (b"\x0a" + varint(1 << 63), "declares 9,223,372,036,854,775,808 bytes, but 0 are left"),
     "nested and too long": (
         feature(b"\x0a\x7f" + bytes(9)),
         "field 1 of Feature .* declares 127 bytes, but 9 are left",
     ),
-    "2^63 in the list": (feature(field(1, b"\x0a" + varint(1 << 63))), "field 1 of BytesList .* 9223372036854775808"),
+    "2^63 in the list": (
+        feature(field(1, b"\x0a" + varint(1 << 63))),
+        "field 1 of BytesList .* 9,223,372,036,854,775,808",
+    ),
     "no end": (b"\x0a\xff\xff", "the number at byte 1 of the record has no end"),
     "eleven bytes": (b"\x0a" + b"\x80" * 10 + b"\x00", "the number at byte 1 of the record has no end"),
     "an end beyond": (feature(b"\x0a"), "the number at byte 10 of the record has no end"),

@@ -156,7 +156,7 @@ def test_a_plastic_strain_of_an_elastic_body_is_told(at):
     one = replace(one, fields={"PEEQ": NamedField(strained, at)})
     what = "elements with a plastic strain, but without a yield stress"
     told = [finding for finding in in_trajectory(one) if finding.what == what]
-    assert [(one.count, one.places) for one in told] == [(2, "elements 2, 3") if at == "element" else (1, "elements 2")]
+    assert [(one.count, one.places) for one in told] == [(2, "elements 2, 3") if at == "element" else (1, "element 2")]
     young = one.scene.material[:, 0]
     for limit, count in ((3e8, 0), (0, len(told))):
         material = np.column_stack([one.scene.material, np.full(rows, limit)]).astype(np.float32)

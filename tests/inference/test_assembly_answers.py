@@ -94,6 +94,16 @@ def test_a_sweep_is_many_predictions(trained, tmp_path):
 BETWEEN = '[[contact]]\nparts = ["block", "punch"]\nfriction = 0.4\n\n[parameters]'
 
 
+def test_a_sweep_tells_elements_that_are_turned_over(trained, monkeypatch):
+    spec, run = trained
+    monkeypatch.setattr(
+        "ast_sim.inference.sweep.impossible", lambda answer: ["7 are"] if answer.name == "row 1" else []
+    )
+    with pytest.warns(UserWarning, match="elements are turned over in 1 of 2 rows; the first: row 1: 7 are"):
+        swept = run.sweep(spec, {"travel": [0.8, 1.0]})
+    assert [row.get("notes") for row in swept.rows] == [None, "7 are"]
+
+
 @pytest.mark.parametrize("rubs", ["friction = 0.4\n\n[parameters]", "friction = [0.3, 0.5]\n\n[parameters]", BETWEEN])
 def test_with_friction_a_sweep_knows_the_frame_before(tmp_path, rubs):
     spec = write_assembly(tmp_path, SPEC.replace("[parameters]", rubs))
@@ -118,7 +128,9 @@ def test_rows_outside_the_training_are_told_once(trained):
     spec, run = trained
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        run.sweep(spec, {"travel": [1.0, 2.4, 2.6]})
+        swept = run.sweep(spec, {"travel": [1.0, 2.4, 2.6]})
+    assert ["in training" in row.get("notes", "") for row in swept.rows] == [False, True, True]
+    assert swept.rows[2]["notes"].startswith("travel is 2.6; in training 0.5 to 1.5")  # in the table, too
     (note,) = [str(one.message) for one in caught if "training scenes" in str(one.message)]
     assert note == (
         "2 of 3 rows lie outside the training scenes; the first: row 1: travel is 2.4; in training 0.5 to 1.5"

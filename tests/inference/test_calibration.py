@@ -207,6 +207,29 @@ def test_a_prediction_that_asks_for_an_error_makes_the_chosen_effort(calibrated)
     assert np.array_equal(answer.position, run.predict(truth, effort=Effort()).position)
 
 
+def test_no_error_is_promised_of_a_smaller_displacement_than_any_in_training(calibrated):
+    """An error is a share of the displacement, and of a small one it may be larger."""
+    run, data, result = calibrated
+    with ast_sim.Dataset(data) as dataset:
+        truth = next(t for t in (dataset["test"][i] for i in range(24)) if not run.predict(t).notes)
+    least = run.scope.travel[0]
+    kept = KeptErrors((Effort(),), {"displacement": ((0.4,) * 20,)})
+    run.calibration = replace(result, kept=kept, familiarity=None)
+    try:
+        assert "promise" in run.predict(truth, error=0.5).source
+        for depth, frames in ((0.9, None), (1.0, [1])):
+            motion = {1: (0, 0, -depth * least)}
+            with pytest.warns(
+                UserWarning, match="no error is promised: prescribed nodes move up to .* in the wanted fra"
+            ):
+                answer = run.predict(truth.scene, motion, num_frames=5, frames=frames, error=0.5)
+            assert "promise" not in answer.source and answer.source["effort"] == "0 corrections"
+        shallow = run.predict(truth.scene, {1: (0, 0, -0.96 * least)}, num_frames=5, error=0.5)
+        assert "promise" in shallow.source  # within the leeway
+    finally:
+        run.calibration = result
+
+
 def test_a_quantity_that_is_added_gets_a_band(calibrated, tmp_path, monkeypatch):
     """docs/how-to/new-dial-or-band.md: one function is enough."""
     run, data, result = calibrated

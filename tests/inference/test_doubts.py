@@ -146,7 +146,7 @@ def test_the_command_line_tells_an_overlap_once(held, tmp_path, capsys):
     lines = "".join(capsys.readouterr()).splitlines()
     (told_of,) = [line for line in lines if "overlap" in line]
     assert "pairs of bodies that overlap: 1 (at" in told_of and "body 1 lies 0.025 inside body 0" in told_of
-    assert sum("warning: bodies of one element: 1 (elements" in line for line in lines) == 1
+    assert sum("warning: bodies of one element: 1 (element " in line for line in lines) == 1
 
 
 def test_overlaps_are_looked_for_once_in_a_scene(held, monkeypatch):
@@ -173,10 +173,12 @@ def test_a_scene_so_flat_that_its_answer_turns_over_is_told(plate):
     assert any("elements are turned over in frame 1" in line for line in lines)
 
 
-def test_positions_that_single_precision_has_rounded_are_refused(plate):
+@pytest.mark.parametrize("axis", [0, 2])
+def test_positions_that_single_precision_has_rounded_are_refused(plate, axis):
+    """Along z, across the plate, elements have been rounded flat, too."""
     scene, motion = plate
     for distance, fits in ((1e3, True), (1e6, False)):
-        shift = np.float32([distance, 0, 0])
+        shift = distance * np.eye(3, dtype=np.float32)[axis]
         moved = replace(scene, rest_position=scene.rest_position + shift)
         if fits:
             told(moved, motion + shift)
@@ -198,3 +200,18 @@ def test_free_nodes_of_no_element_are_told(plate):
     )
     _, lines = told(wider, np.concatenate([motion, np.repeat(more[None], 2, axis=0)], axis=1))
     assert any("3 free nodes belong to no element: what is predicted for them means nothing" in line for line in lines)
+
+
+def test_a_file_of_an_answer_holds_what_was_told(held, tmp_path):
+    """Whoever reads the file has not seen the warnings."""
+    scene, motion = held
+    far = motion.copy()
+    far[1, scene.body == 1] -= np.float32([0, 0, 0.2])
+    answer, _ = told(scene, far)
+    answer.save(tmp_path / "told.h5")
+    replace(answer, notes=()).save(tmp_path / "usual.h5")
+    kept = []
+    for name in ("told", "usual"):
+        with ast_sim.Dataset(tmp_path / f"{name}.h5") as data:
+            kept.append(data["test"][0].attributes.get("notes"))
+    assert kept == ["; ".join(answer.notes), None] and "move up to 0.22 m from their start" in kept[0]

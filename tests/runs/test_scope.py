@@ -81,3 +81,24 @@ def test_the_ranges_are_those_of_all_scenes(dataset):
     np.testing.assert_allclose(plain.motion_high, (0, 0, 0), atol=1e-6)
     np.testing.assert_allclose(mirrored.motion_low, (0, 0, -0.2), atol=1e-6)
     np.testing.assert_allclose(mirrored.motion_high, (0, 0, 0.2), atol=1e-6)
+
+
+def test_what_was_prescribed_before_the_first_frame_counts(dataset):
+    """A motion whose first frame is pressed in already has travelled from rest, though nothing moves after it."""
+    scene, position = pressed((0, 0, -0.6))
+    pressed_in = np.repeat(position[1:], 2, axis=0)
+    told = ["prescribed nodes move up to 0.6 m from their start; in training 0 m to 0.2 m"]
+    assert notes(dataset, scene, pressed_in) == notes(dataset, scene, position) == told
+    scene, position = pressed((0.15, 0, 0))
+    told = ["prescribed nodes move 0.15 m along x; in training 0 m to 0 m"]
+    assert notes(dataset, scene, np.repeat(position[1:], 2, axis=0)) == told
+
+
+def test_the_ranges_of_the_training_begin_at_rest_but_with_inertia_in_the_first_frame(dataset, tmp_path):
+    scene, position = pressed((0, 0, -0.2))
+    for kind, travel in (("quasi_static", 0.2), ("dynamic", 0.0)):
+        info = replace(dataset.info, integration=kind, time_step=0.1)
+        with DatasetWriter(tmp_path / f"{kind}.h5", info) as writer:
+            writer.add("train", ast_sim.Trajectory(scene, np.repeat(position[1:], 3, axis=0), None, {}))
+        with Dataset(tmp_path / f"{kind}.h5") as opened:
+            assert scope_of(opened, DataFacts.of(info, (), 1.0)).travel == pytest.approx((travel, travel), abs=1e-6)

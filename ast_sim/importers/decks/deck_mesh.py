@@ -110,10 +110,10 @@ class _Assembly:
             kind = f"of the type {name}"
             notes.append(f"{counted(count, f'element {kind} is', f'elements {kind} are')} left out")
         if self.deck.formulas:
-            notes.append(
-                f"rigid surfaces without elements are left out: {', '.join(self.deck.formulas)}; a tool needs a mesh,"
-                " for example of R3D4"
+            are = counted(
+                len(self.deck.formulas), "rigid surface without elements is", "rigid surfaces without elements are"
             )
+            notes.append(f"{are} left out: {', '.join(self.deck.formulas)}; a tool needs a mesh, for example of R3D4")
         turned = sum(len(block.nodes) for block in self.blocks if block.label.startswith(REVOLVED))
         if turned:
             are = counted(turned, "element is a section", "elements are sections")

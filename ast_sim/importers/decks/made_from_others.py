@@ -21,7 +21,7 @@ from ast_sim.importers.decks.deck_axes import from_angles, placement_of
 from ast_sim.importers.decks.deck_numbers import real, tokens, whole
 from ast_sim.importers.decks.deck_parts import Content, ElementBlock
 from ast_sim.importers.decks.keyword_lines import Keyword, Line
-from ast_sim.support.errors import DatasetError
+from ast_sim.support.errors import DatasetError, counted
 
 # What one line may make; a wrong number would fill the memory.
 _MOST = 20_000_000
@@ -163,7 +163,7 @@ def _filled(
     count, step = whole(intervals or "1", line), whole(increment or "1", line)
     _require_few(keyword, line, count * len(first))
     if count < 1 or step == 0:
-        raise keyword.error(f"{line.place}: {count} intervals in steps of {step}")
+        raise keyword.error(f"{line.place}: {counted(count, 'interval')} in steps of {step}")
     shares = _shares(keyword, count)[:, None]
     numbers = first[:, None] + step * np.arange(1, count)
     if (numbers < 1).any():
@@ -179,10 +179,12 @@ def _shares(keyword: Keyword, count: int) -> np.ndarray:
     bias = real(keyword.options.get("BIAS") or "1", keyword.line)
     pairs = "TWOSTEP" in keyword.options
     if not bias > 0 or (pairs and count % 2):
-        raise keyword.error(f"BIAS={bias:g} of {count} intervals; must be above 0, and TWO STEP needs an even number")
+        raise keyword.error(
+            f"BIAS={bias:g} of {counted(count, 'interval')}; must be above 0, and TWO STEP needs an even number"
+        )
     lengths = bias ** -(np.arange(count) // (2 if pairs else 1)).astype(float)
     if not np.isfinite(lengths.sum()):
-        raise keyword.error(f"BIAS={bias:g} of {count} intervals makes intervals of no length")
+        raise keyword.error(f"BIAS={bias:g} of {counted(count, 'interval')} makes intervals of no length")
     return (np.cumsum(lengths) / lengths.sum())[:-1]
 
 
@@ -212,7 +214,9 @@ def _reflected(keyword: Keyword, points: np.ndarray) -> np.ndarray:
     given = [_entries(keyword, line, 6) for line in keyword.data]
     values = [real(text, line) for row, line in zip(given, keyword.data, strict=True) for text in row[:6]][:needed]
     if not needed or len(given) != (2 if kind == "MIRROR" else 1):
-        raise keyword.error(f"REFLECT={kind} with {len(given)} lines; POINT and LINE must have one, MIRROR two")
+        raise keyword.error(
+            f"REFLECT={kind} with {counted(len(given), 'line')}; POINT and LINE must have one, MIRROR two"
+        )
     origin, *others = np.array(values).reshape(-1, 3)
     offset = points - origin
     if kind == "POINT":

@@ -9,12 +9,12 @@ from __future__ import annotations
 import itertools
 import re
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 
 from ast_sim.importers.decks.nastran_axes import NastranPoints
 from ast_sim.importers.formats.source_mesh import INSTEAD
-from ast_sim.support.errors import DatasetError
+from ast_sim.support.errors import DatasetError, counted
 
 # Elements of Nastran: the numbers of nodes that they may have, the corners first, and what meshio calls them.
 _ELEMENTS = {
@@ -37,6 +37,9 @@ _ELEMENTS = {
 _NAMES = {"CPYRAM": "CPYRA", "CTRIAR": "CTRIA3", "CQUADR": "CQUAD4", "CQUAD": "CQUAD4", "CBAR": "CROD", "CBEAM": "CROD"}
 _OF_CORNERS = {"CTRIA6": "CTRIA3", "CQUAD8": "CQUAD4"}
 
+# Cards that say where points are.
+_OF_POINTS = re.compile("GRID|GRDSET|CORD[12][RCS]")
+
 # Cards of Nastran with the same first letter that are no elements of a volume or a surface.
 _NO_ELEMENTS = re.compile(
     r"CORD|CONM|CMASS|CELAS|CDAMP|CVISC|CTUBE|CONROD|CFAST|CWELD|CSEAM|CBEND|CBEAM3|CHBDY|CLOAD|CREEP|CAERO|CSUP|CYJOIN"
@@ -46,54 +49,67 @@ _NO_ELEMENTS = re.compile(
 # Cards that tie points to each other or add to them; they are told where a mesh is read without them.
 _TOLD = re.compile(
     r"(CONM[12]|CMASS[1-4]|CELAS[1-4]|CDAMP[1-5]|CVISC|CTUBE|CONROD|CFAST|CWELD|CSEAM|CBEND|CBEAM3|CBUSH(?:1D|2D|T)?"
-    r"|CGAP|CSHEAR|RBE[123]|RBAR1?|RROD|RSPLINE|RSSCON|RTRPLT1?|MPC|SPOINT)[*,\s]"
+    r"|CGAP|CSHEAR|RBE[123]|RBAR1?|RROD|RSPLINE|RSSCON|RTRPLT1?|MPC|SPOINT)\s"
 )
 
-
-def left_out_of_nastran(path: Path) -> list[str]:
-    """A note on the elements without a surface and on the constraints of a deck, which no mesh has, with their counts.
-
-    Raises:
-        DatasetError: an included file is missing.
-    """
-    names = (_TOLD.match(f"{row.lstrip().upper()} ") for _, row in _bulk_data(path))
-    counts = Counter(name[1] for name in names if name)
-    listed = ", ".join(f"{count} {name}" for name, count in sorted(counts.items()))
-    return [f"cards that are no part of a mesh are left out: {listed}"] if listed else []
+# By name and number: what a card says, and its place.
+_Seen = dict[tuple[str, str], tuple[list[str], str]]
 
 
-def plain_nastran(path: Path) -> bytes:
-    """A deck of Nastran with the points and elements of a deck, and of the files that it includes, alone.
+def plain_nastran(path: Path) -> tuple[bytes, list[str]]:
+    """A deck of Nastran with the points and elements of a deck, and of the files that it includes, alone. A note on the
+    elements without a surface and on the constraints, which no mesh has, with their counts.
 
     Raises:
-        DatasetError: it holds elements that are not known, lacks something, or has two points of one number; the text
-            names the file and the line.
+        DatasetError: it holds elements that are not known, lacks something, or has two unlike points, or elements of a
+            kind, of one number; the text names the file and the line.
     """
     points = NastranPoints(path)
     cells: list[str] = []
-    places: dict[str, tuple[list[str], str]] = {}
+    left_out: Counter[str] = Counter()
+    seen: _Seen = {}
+    whole: list[tuple[str, list[str]]] = []  # GRIDs whose coordinates lack points
     for place, (card, *fields) in _cards_of_nastran(path):
         name = card.rstrip("_")
         if name.startswith("C") and name not in _ELEMENTS and not _NO_ELEMENTS.match(name):
             raise DatasetError(f"{path}: holds {name} elements, which are not read ({place}): {INSTEAD}")
         if name == "GRID":
             fields[0] = fields[0].lstrip("0")
-            before, where = places.setdefault(fields[0], (fields[1:5], place))
-            if before != fields[1:5]:
-                raise DatasetError(
-                    f"{path}: GRID {fields[0]} stands twice, with different fields ({where} and {place}): leave one out"
-                )
-        if name in ("GRID", "GRDSET") or re.fullmatch("CORD[12][RCS]", name):
+            if all(text.lstrip("-+").isdigit() for text in fields[2:5]):
+                whole.append((place, fields))
+            _require_alike(path, seen, place, name, fields[0], fields[1:5])
+        if _OF_POINTS.fullmatch(name):
             points.take(place, name, fields)
         elif name in _ELEMENTS:
-            cells += _plain_element(path, place, name, fields)
+            fields[:2] = [text.lstrip("0") for text in fields[:2]]
+            rows = _plain_element(path, place, name, fields)
+            _require_alike(path, seen, place, name, fields[0], rows)
+            cells += rows
+        elif told := _TOLD.match(f"{name} "):
+            left_out[told[1]] += 1
+    _require_reals(path, whole, points.systems)
     if not points.grids:
         raise DatasetError(f"{path}: cannot be read as a mesh: holds no GRID, so it is no deck of Nastran; {INSTEAD}")
     missing = {node for row in cells for node in row.split(",")[1 if row[0] == "+" else 3 :]} - points.grids.keys()
     if missing:
         raise DatasetError(f"{path}: an element has the node {min(missing)}, and there is no GRID of this number")
     rows = [",".join(["GRID", number, "", *points.texts(number)]) for number in points.grids]
-    return "\n".join(["BEGIN BULK", *rows, *cells, "ENDDATA\n"]).encode()
+    listed = ", ".join(f"{count} {name}" for name, count in sorted(left_out.items()))
+    are = counted(left_out.total(), "card that is no part of a mesh is", "cards that are no part of a mesh are")
+    notes = [f"{are} left out: {listed}"] if listed else []
+    return "\n".join(["BEGIN BULK", *rows, *cells, "ENDDATA\n"]).encode(), notes
+
+
+def _require_alike(path: Path, seen: _Seen, place: str, name: str, number: str, content: list[str]) -> None:
+    """Raise DatasetError if a card of this name and number has been seen with another content. Nastran stops at all
+    such cards (its message 311), but a file may be included twice. Cards of two names may share a number there, though
+    its manual says that all elements have numbers of their own."""
+    before, where = seen.setdefault((name, number), (content, place))
+    if before != content:
+        raise DatasetError(
+            f"{path}: {name} {number} stands twice, with different fields ({where} and {place}): leave one out, or give"
+            " it another number"
+        )
 
 
 def _plain_element(path: Path, place: str, name: str, fields: list[str]) -> list[str]:
@@ -109,6 +125,8 @@ def _plain_element(path: Path, place: str, name: str, fields: list[str]) -> list
             f"{path}: {name} {fields[0]} ({place}) has the nodes {', '.join(nodes)}; must have"
             f" {' or '.join(map(str, _ELEMENTS[name]))}: are lines of the file missing or cut short?"
         )
+    if not fields[0].isdigit():
+        raise DatasetError(f"{path}: {name} ({place}) has the number {fields[0]!r}; must be a whole number above 0")
     entries = [fields[0], fields[1] or fields[0], *nodes]
     rows = [entries[at : at + 8] for at in range(0, len(entries), 8)]
     return [",".join([_NAMES.get(name, name), *rows[0]]), *(",".join(["+", *row]) for row in rows[1:])]
@@ -127,6 +145,7 @@ def _cards_of_nastran(path: Path) -> Iterator[tuple[str, list[str]]]:
             raise DatasetError(
                 f"{path}: {place} repeats the card before it ('='), which is not read: write each card out"
             )
+        _require_no_decimal_comma(path, place, row, card[0] if card else "")
         wide = "*" in row.partition(",")[0][:8]
         size, width = (16, 4) if wide else (8, 8)
         texts = row.split(",") if "," in row else [row[:8], *(row[at : at + size] for at in range(8, 80, size))]
@@ -144,6 +163,29 @@ def _cards_of_nastran(path: Path) -> Iterator[tuple[str, list[str]]]:
         card += [""] * (-(len(card) - 1) % width)
     if card:
         yield first, card + 8 * [""]
+
+
+def _require_no_decimal_comma(path: Path, place: str, row: str, before: str) -> None:
+    """Raise DatasetError if a line in fields of 8 or 16 characters has a comma in one: it would be taken for a line
+    between commas. `before` is the name of the card that it may go on with."""
+    start, comma, _ = row.partition(",")
+    if not comma or not (len(start.split()) > 1 or re.match(r"\s{8,}[-+.\d]", start)):
+        return
+    name = before if row[0] in " +*" else start.split()[0].upper().rstrip("*")
+    if name in _ELEMENTS or _OF_POINTS.fullmatch(name):
+        raise DatasetError(f"{path}: {place} has a comma in a field of 8 or 16 characters: write decimal points")
+
+
+def _require_reals(path: Path, whole: list[tuple[str, list[str]]], systems: Collection[str]) -> None:
+    """Raise DatasetError if the fields of a GRID may be coordinates with decimal commas, as in GRID,1,,1,5,0,2,3,1: the
+    coordinates are whole numbers, and behind them stand a second system that the deck lacks, or a superelement."""
+    for place, fields in whole:
+        system, _, superelement = (text if text.isdigit() and int(text) else "" for text in fields[5:8])
+        if superelement or (system and system not in systems):
+            raise DatasetError(
+                f"{path}: the coordinates {', '.join(fields[2:5])} of GRID {fields[0]} ({place}) are whole numbers,"
+                f" followed by {', '.join(filter(None, fields[5:8]))}: are the commas decimal ones? Write points"
+            )
 
 
 def _bulk_data(path: Path) -> Iterator[tuple[str, str]]:

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from ast_sim.importers.formats.source_mesh import INSTEAD, CellBlock, SourceMesh, node_count
-from ast_sim.support.errors import DatasetError
+from ast_sim.support.errors import DatasetError, counted
 
 _KINDS_OF_MFEM = dict(enumerate(("vertex", "line", "triangle", "quad", "tetra", "hexahedron", "wedge", "pyramid")))
 
@@ -137,7 +137,7 @@ def _mfem(path: Path, lines: list[list[str]]) -> SourceMesh:
         else:
             raise DatasetError(f"{path}: has a section {section!r}, which is not read: {INSTEAD}")
     if len(points) != count:
-        raise ValueError(f"it says that it holds {count} vertices, but there are {len(points)}")
+        raise ValueError(f"it says that it holds {counted(count, 'vertex', 'vertices')}, but there are {len(points)}")
     blocks = _blocks(rows, np.arange(count))
     cell_tags = [np.array(tags[block.kind]) for block in blocks]
     groups = {name: np.unique(nodes) for name, nodes in boundary.items()}
@@ -159,7 +159,8 @@ def _corners_of_mfem(path: Path, lines: list[list[str]], count: int) -> tuple[np
     by_axis = facts["Ordering"] == "0"
     points = values.reshape(columns, -1).T if by_axis else values.reshape(-1, columns)
     more = len(points) - count
-    told = [f"{more} points within curved elements are left out: the corners are taken"] if more else []
+    are = counted(more, "point within curved elements is", "points within curved elements are")
+    told = [f"{are} left out: the corners are taken"] if more else []
     return np.pad(points[:count], ((0, 0), (0, 3 - columns))), told
 
 
@@ -196,7 +197,9 @@ def _gid(path: Path, lines: list[list[str]]) -> SourceMesh:
         elif [word.lower() for word in words] == ["elements"]:
             for row in _until(entries, "elements"):
                 if len(row) - 1 - node_count(kind) not in (0, 1):  # a material may stand behind
-                    raise ValueError(f"element {row[0]} has {len(row) - 1} entries behind its number")
+                    raise ValueError(
+                        f"element {row[0]} has {counted(len(row) - 1, 'entry', 'entries')} behind its number"
+                    )
                 nodes = [int(word) for word in row[1 : 1 + node_count(kind)]]
                 rows[kind].append(nodes)
                 parts[name] += nodes

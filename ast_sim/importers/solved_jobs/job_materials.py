@@ -95,9 +95,10 @@ class _Material:
         listed = "; ".join(f"{name} is {one}" for name, one in self.numbers.items() if len(one.values) > 1)
         unknown = np.isnan(temperatures)
         if unknown.any():
+            have = counted(unknown.sum(), "of its elements has", "of its elements have")
             return [
-                f"the material {self.name} depends on the temperature ({listed}), and {unknown.sum()} of its elements"
-                " have none that the deck says and keeps: say it for all nodes by *INITIAL CONDITIONS,"
+                f"the material {self.name} depends on the temperature ({listed}), and {have} none that the"
+                " deck says and keeps: say it for all nodes by *INITIAL CONDITIONS,"
                 " TYPE=TEMPERATURE, or leave the lines of one temperature only"
             ]
         low, high = temperatures.min(), temperatures.max()

@@ -85,16 +85,17 @@ def test_the_layer_of_a_closed_tool_lies_inside_it(name, turned, tmp_path):
 
 def test_a_thin_tool_presses_as_its_tetrahedra_would(tmp_path):
     """The blade of 0.4 mm, 8 mm above the pad, with edges of 4.8 mm: half a mesh width is six times its thickness."""
-    path = write(tmp_path, TOOLS["blade"])
+    spec = SPEC.replace("frames = 5", "frames = 3")
+    path = write(tmp_path, TOOLS["blade"], spec)
     case = case_of(path)
     assert gap_between(case, (0, 1)) == pytest.approx(8, rel=1e-3)
     as_surface = assembly.in_newton(assembly.solve(case), "mm")
     write_box(tmp_path / "tool.vtu", (-12, -12, 8), (12, 12, 8.4), (5, 5, 1))
-    path.write_text(SPEC.replace("tool.stl", "tool.vtu"))
+    path.write_text(spec.replace("tool.stl", "tool.vtu"))
     as_solid = assembly.in_newton(assembly.solve(case_of(path)), "mm")
-    assert as_surface.attributes["reaction"][:4] == [0, 0, 0, 0]
-    assert as_surface.attributes["reaction"][4] == pytest.approx(as_solid.attributes["reaction"][4], rel=1e-3)
-    assert as_surface.attributes["reaction"][4] > 10
+    *before, pressed = as_surface.attributes["reaction"]
+    assert before == [0, 0]
+    assert pressed == pytest.approx(as_solid.attributes["reaction"][-1], rel=1e-3) and pressed > 10
 
 
 def test_a_sheet_between_two_parts_leaves_the_gap_behind_it(tmp_path):

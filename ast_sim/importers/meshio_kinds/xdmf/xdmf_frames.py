@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from ast_sim.importers.formats.source_mesh import SourceMesh, from_meshio
-from ast_sim.importers.meshio_files import by_meshio, what_meshio_says
-from ast_sim.importers.xdmf.xdmf_grids import with_one_grid, with_one_series
-from ast_sim.importers.xdmf.xdmf_items import made_of_others, require_linked, with_joined_points, write_out
-from ast_sim.importers.xdmf.xdmf_spellings import (
+from ast_sim.importers.meshio_kinds.meshio_files import by_meshio, what_meshio_says
+from ast_sim.importers.meshio_kinds.xdmf.xdmf_grids import with_one_grid, with_one_series
+from ast_sim.importers.meshio_kinds.xdmf.xdmf_items import made_of_others, require_linked, with_joined_points, write_out
+from ast_sim.importers.meshio_kinds.xdmf.xdmf_spellings import (
     with_defaults,
     with_fields_of_one_step,
     with_known_words,
@@ -54,9 +54,9 @@ def xdmf_frames(path: Path) -> Iterator[SourceMesh]:
             f"{path}: is XDMF of the version {version}; write a series of version 3 (Xdmf3 in ParaView), .vtkhdf or"
             " .pvd"
         )
-    named = ", ".join(dict.fromkeys(one.get("Name", "without a name") for one in tree.iter("Set")))
+    sets = dict.fromkeys(one.get("Name", "without a name") for one in tree.iter("Set"))
     several |= bool(told) or (not series and len(tree.findall("Domain/Grid")) > 1)
-    told += [f"sets are not read: {named}"] if named else []
+    told += [f"{counted(len(sets), 'set is', 'sets are')} not read: {', '.join(sets)}"] if sets else []
     told += [] if series else with_one_grid(path, tree)
     time, timed = (None, False) if series else without_time(path, tree)
     if series:

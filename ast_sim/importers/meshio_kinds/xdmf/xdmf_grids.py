@@ -41,7 +41,8 @@ def with_one_grid(path: Path, tree: ET.ElementTree[Any]) -> list[str]:
         domain.remove(grid)
     left_out = [grid for grid in others if grid.find("Attribute") is not None or -1 < _rank(grid)[0] != _rank(kept)[0]]
     named = [grid.get("Name", "without a name") for grid in left_out]
-    return [f"grids on the same points are left out: {', '.join(named)}"] if named else []
+    are = counted(len(named), "grid on the same points is", "grids on the same points are")
+    return [f"{are} left out: {', '.join(named)}"] if named else []
 
 
 def with_one_series(tree: ET.ElementTree[Any]) -> bool:

@@ -8,7 +8,7 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import Any
 
-from ast_sim.support.errors import DatasetError
+from ast_sim.support.errors import DatasetError, counted
 
 # The words of XDMF that meshio knows in one spelling; XDMF itself takes capital and small letters alike.
 _WORDS = {
@@ -63,7 +63,9 @@ def without_fields_of_grids(tree: ET.ElementTree[Any]) -> list[str]:
     for grid, one in fields:
         grid.remove(one)
     names = dict.fromkeys(repr(one.get("Name", "without a name")) for _, one in fields)
-    return [f"fields with one value for the whole grid are left out: {', '.join(names)}"] if names else []
+    fields = "with one value for the whole grid"
+    are = counted(len(names), f"field {fields} is", f"fields {fields} are")
+    return [f"{are} left out: {', '.join(names)}"] if names else []
 
 
 def with_own_times(path: Path, tree: ET.ElementTree[Any]) -> bool:
@@ -83,7 +85,7 @@ def with_own_times(path: Path, tree: ET.ElementTree[Any]) -> bool:
         if time.get("TimeType", "").upper() == "HYPERSLAB" and len(values) == 3:
             values = [values[0] + values[1] * row for row in range(int(values[2]))]
         if len(values) != len(grids):
-            raise DatasetError(f"{path}: lists {len(values)} times for {len(grids)} frames")
+            raise DatasetError(f"{path}: lists {counted(len(values), 'time')} for {counted(len(grids), 'frame')}")
         if any(grid.find("Time") is not None for grid in grids):
             raise DatasetError(f"{path}: lists the times of its frames, and some have a Time of their own: write one")
         series.remove(time)

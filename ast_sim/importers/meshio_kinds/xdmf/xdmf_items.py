@@ -108,7 +108,7 @@ def _values(path: Path, item: ET.Element) -> np.ndarray:
     if values.size != np.prod(shape):
         raise DatasetError(
             f"{path}: numbers of the type {item.get('ItemType')} have the Dimensions {item.get('Dimensions', 'none')},"
-            f" but {values.size} are chosen"
+            f" but {counted(values.size, 'is', 'are')} chosen"
         )
     return values.reshape(shape)
 
