@@ -1,4 +1,4 @@
-"""Answers to questions, by jumps or step by step. A scene that lies elsewhere is moved into the model's domain."""
+"""Answers to questions, by jumps or step by step. A scene that lies elsewhere is moved to where training scenes lay."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from ast_sim.inference.predicting.jump import jumps
 from ast_sim.inference.predicting.question import Question
 from ast_sim.inference.predicting.rollout import rollouts
 from ast_sim.mechanics.physics_check import turned_over
-from ast_sim.models.model_config import ModelConfig
 from ast_sim.models.simulator import Simulator
 from ast_sim.ops import products_in
+from ast_sim.runs.scope import Scope
 from ast_sim.support.errors import counted
 from ast_sim.support.progress import ShowProgress
 
@@ -40,11 +40,12 @@ def answers(
     return [dataclasses.replace(answer, seconds=each) for answer in predicted]
 
 
-def in_domain(
-    model: Simulator, questions: Sequence[Question], effort: Effort, progress: ShowProgress = False
+def in_place(
+    model: Simulator, scope: Scope, questions: Sequence[Question], effort: Effort, progress: ShowProgress = False
 ) -> list[Answer]:
-    """Predict scenes where they lie. A scene that leaves the domain is predicted in its middle, if it may be moved."""
-    shifts = [_way_into_domain(model.config, question) for question in questions]
+    """Predict scenes where training scenes lay, since some models read positions, and give the answers where the scenes
+    lie. A scene that leaves the domain even so is predicted in the middle of the domain."""
+    shifts = [_way_back(scope, question) for question in questions]
     there = [q if shift is None else _moved_question(q, shift) for q, shift in zip(questions, shifts, strict=True)]
     predicted = zip(questions, shifts, answers(model, there, effort, progress), strict=True)
     return [answer if shift is None else _moved_back(question, answer, shift) for question, shift, answer in predicted]
@@ -87,18 +88,19 @@ def _moved_back(question: Question, answer: Answer, shift: np.ndarray) -> Answer
     return dataclasses.replace(answer, scene=question.scene, position=position)
 
 
-def _way_into_domain(config: ModelConfig, question: Question) -> np.ndarray | None:
-    """[3] float64: from the middle of the start and of all that is prescribed to the middle of the domain; None: both
-    lie inside the domain, or the scene stays where it is."""
+def _way_back(scope: Scope, question: Question) -> np.ndarray | None:
+    """[3] float64: the way to a place that the model knows; None: the scene lies there, or stays where it is."""
+    if not question.movable:
+        return None
+    way = scope.way_back(question.scene)
     position = question.prescribed_position
     known = np.concatenate([position[0], position[:, question.scene.prescribed].reshape(-1, 3)])
     known = known.T.astype(np.float64, order="C")  # rows are reduced faster
-    lowest, highest = known.min(axis=1), known.max(axis=1)
-    center = np.array(config.data.domain_center)
-    inside = max((center - lowest).max(), (highest - center).max()) <= config.data.domain_half_width
-    if inside or not question.movable:
-        return None
-    return center - (lowest + highest) / 2
+    lowest, highest = known.min(axis=1) + way, known.max(axis=1) + way
+    center = np.array(scope.data.domain_center)
+    if max((center - lowest).max(), (highest - center).max()) > scope.data.domain_half_width:
+        way += center - (lowest + highest) / 2
+    return way if way.any() else None
 
 
 def _moved(points: np.ndarray, shift: np.ndarray) -> np.ndarray:

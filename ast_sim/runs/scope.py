@@ -38,6 +38,8 @@ class Scope:
         usual_increment: the median of that displacement over all frames in which one moves; 0 if none ever does.
         material_low, material_high: the lowest and the highest number of each material column.
         data: what the model knows of its data.
+        middle_low, middle_high: the lowest and the highest middle of the box around the deforming bodies at rest, along
+            x, y and z; empty in older runs.
     """
 
     family: str
@@ -56,6 +58,8 @@ class Scope:
     material_low: tuple[float, ...]
     material_high: tuple[float, ...]
     data: DataFacts
+    middle_low: tuple[float, ...] = ()
+    middle_high: tuple[float, ...] = ()
 
     @property
     def material_ranges(self) -> dict[str, tuple[float, float]]:
@@ -84,6 +88,14 @@ class Scope:
                 yield f"{text.format(shown)}; in training {' to '.join(limits)}"
         if travel <= (1 + LEEWAY) * self.travel[1]:  # else their travel tells it
             yield from self._directions(scene, motion)
+
+    def way_back(self, scene: Scene) -> np.ndarray:
+        """[3] float64: the shortest way to where training scenes lie; zero if the scene lies there already."""
+        if not self.middle_low:
+            return np.zeros(3)
+        middle = middle_of(scene)
+        way = np.clip(middle, self.middle_low, self.middle_high) - middle
+        return way if np.abs(way).max() > LEEWAY * size_of(scene) else np.zeros(3)
 
     def _directions(self, scene: Scene, motion: Motion) -> Iterator[str]:
         """One sentence for each axis along which prescribed nodes move farther than in training."""
@@ -118,9 +130,21 @@ def size_of(scene: Scene) -> float:
     return _diagonal(scene, scene.deforming_nodes)
 
 
+def middle_of(scene: Scene) -> np.ndarray:
+    """[3] float64: the middle of the box around the deforming bodies at rest; the origin if there are none."""
+    lowest, highest = _box(scene, scene.deforming_nodes)
+    return (lowest + highest) / 2
+
+
 def _diagonal(scene: Scene, nodes: np.ndarray) -> float:
+    lowest, highest = _box(scene, nodes)
+    return float(np.linalg.norm(highest - lowest))
+
+
+def _box(scene: Scene, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """[3] and [3] float64: the lowest and the highest coordinates of nodes at rest; zeros if there are none."""
     points = scene.rest_position[nodes].T.astype(np.float64, order="C")  # rows are reduced faster
-    return float(np.linalg.norm(np.ptp(points, axis=1))) if points.size else 0.0
+    return (points.min(axis=1), points.max(axis=1)) if points.size else (np.zeros(3), np.zeros(3))
 
 
 def held_share_of(scene: Scene) -> float:

@@ -19,7 +19,7 @@ from ast_sim.plausibility.findings import Finding, refusal
 from ast_sim.plausibility.motion import negative_stress
 from ast_sim.plausibility.topology import folded_inside_out
 from ast_sim.prescribed_motion import Motion
-from ast_sim.runs.scope import Scope, edge_lengths, held_share_of, size_of, spacing_of, whole_motion
+from ast_sim.runs.scope import Scope, edge_lengths, held_share_of, middle_of, size_of, spacing_of, whole_motion
 from ast_sim.scene import AttributeValue, NodeType
 from ast_sim.support.errors import TrainingError, warn
 
@@ -115,7 +115,7 @@ def _alike(constants: list[dict[str, AttributeValue | None]]) -> dict[str, float
 def scope_of(dataset: Dataset, data: DataFacts, mirror: Sequence[str] = ()) -> Scope:
     """The ranges of the training split, measured on the same trajectories, and what the model knows of its data;
     `mirror` names the axes along which the training mirrors scenes."""
-    rows, materials, increments, extents = [], [], [], []
+    rows, materials, increments, extents, middles = [], [], [], [], []
     for _, trajectory in dataset.spread("train", MEASURED):
         scene = trajectory.scene
         motion = Motion(trajectory.position)
@@ -125,6 +125,7 @@ def scope_of(dataset: Dataset, data: DataFacts, mirror: Sequence[str] = ()) -> S
         whole = whole_motion(scene, motion, data.dynamic)
         rows.append((*sizes, whole.travel(scene), max(moves)))
         extents.append(whole.extent(scene))
+        middles.append(middle_of(scene))
         if scene.material is not None:
             materials.append(scene.material[scene.deforming_elements])
     names = ("nodes", "size", "spacing", "held", "travel", "increment")
@@ -144,6 +145,8 @@ def scope_of(dataset: Dataset, data: DataFacts, mirror: Sequence[str] = ()) -> S
         material_low=tuple(material.min(axis=0).tolist()),
         material_high=tuple(material.max(axis=0).tolist()),
         data=data,
+        middle_low=tuple(np.min(middles, axis=0).tolist()),
+        middle_high=tuple(np.max(middles, axis=0).tolist()),
     )
 
 

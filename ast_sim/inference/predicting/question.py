@@ -38,7 +38,7 @@ class Question:
             ones are zero.
         frames: the numbers of the frames that are wanted, in the order in which the answer has them; None: all of them,
             the given ones too.
-        movable: the scene may be moved into the domain of the model.
+        movable: the scene may be predicted at a place that the model knows.
         notes: what is unusual about the scene for the model, as sentences.
         times: of all frames of the motion in seconds; None: they are not known.
     """
