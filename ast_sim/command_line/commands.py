@@ -257,7 +257,8 @@ def _predict_spec(run: Any, args: argparse.Namespace, wanted: dict[str, Any]) ->
     _save(answer, args, None)
     units = {"travel_of_nodes": run.scope.length_unit, "reaction": "N", "largest_stress": "Pa"}
     for frame, row in zip(answer.frames, answer.figures(answer.source["origin"]), strict=True):
-        parts = [f"{name} {row[name]:.4g} {unit}" for name, unit in units.items() if name in row]
+        bands = {name: f" (+- {row[f'{name}_band']:.2g})" for name in units if f"{name}_band" in row}
+        parts = [f"{name} {row[name]:.4g} {unit}{bands.get(name, '')}" for name, unit in units.items() if name in row]
         print(f"frame {frame}: {', '.join(parts)}")
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from ast_sim.dataset.layout import DatasetInfo
 from ast_sim.dataset.writer import DatasetWriter
 from ast_sim.inference.quantities.answered_frame import AnsweredFrame
-from ast_sim.inference.quantities.band import Band, band_of, how_far
+from ast_sim.inference.quantities.band import Band, band_of, bands_of, how_far
 from ast_sim.inference.quantities.facts_of_answers import facts_of
 from ast_sim.inference.quantities.forces_and_figures import (
     BodyForce,
@@ -193,7 +193,7 @@ class Answer:
 
     @property
     def trajectory(self) -> Trajectory:
-        """The answer as a trajectory, in ascending order of the frames. Attributes: origin, notes, given frames,
+        """The answer as a trajectory, in ascending order of the frames. Attributes: origin, notes, bands, given frames,
         seconds."""
         order = np.argsort(self.frames, kind="stable")
         frames = tuple(self.frames[row] for row in order)
@@ -201,6 +201,7 @@ class Answer:
             "status": "complete" if self.failure is None else "truncated",
             **self.source,
             **({"notes": "; ".join(self.notes)} if self.notes else {}),  # a file is read without the warnings
+            **{name: band[order].tolist() for name, band in bands_of(self).items()},
             "given_frames": self.given,
             "model_seconds": list(self.step_seconds),
             **({"last_newton_steps": list(self.last_steps)} if self.last_steps else {}),
@@ -307,12 +308,15 @@ class Answer:
         """What an engineer asks of each frame: the travel of the prescribed nodes, the reaction and its components (if
         `reaction` knows it), the largest stress and where it is (if the model predicts one), the largest number of
         each named field (of several columns: the largest norm), the largest `permanent_set` (in the last frame, if
-        there is one), the size of the last Newton step (if any was made).
+        there is one), the size of the last Newton step (if any was made), and each `band` (`displacement_band`,
+        `reaction_band`, `largest_stress_band`).
 
         Args:
             origin: [3] the point that positions are relative to.
         """
-        return figures_of(self, origin)
+        bands = {name: band.tolist() for name, band in bands_of(self).items()}
+        rows = enumerate(figures_of(self, origin))
+        return [figures | {name: band[row] for name, band in bands.items()} for row, figures in rows]
 
     def save(self, path: str | os.PathLike[str], truth: Trajectory | None = None) -> None:
         """Write the answer as a dataset (.h5), as a file for ParaView (.pvd, .vtkhdf), or its `figures` (.csv).

@@ -34,8 +34,9 @@ class Sweep:
     Attributes:
         rows: one for each set of values: the parameters by name, then `travel_of_nodes` (the largest travel of a
             prescribed node), `reaction` (newton) with its components, `largest_stress` (pascal) and where it is
-            (`stress_at_x`, ...), `last_newton_step` (see `Answer.last_steps`), and `notes` where there are some: what
-            lies outside the training, and elements that are turned over.
+            (`stress_at_x`, ...), `last_newton_step` (see `Answer.last_steps`), bands of a calibrated run (see
+            `Answer.figures`), and `notes` where there are some: what lies outside the training, and elements that are
+            turned over.
         varied: the names of the parameters that differ between rows.
         length_unit: unit of all lengths.
         seconds: wall seconds of the model alone, for all rows.

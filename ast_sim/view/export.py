@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import html
 import os
+import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -37,7 +38,9 @@ def write(path: str | os.PathLike[str], trajectory: Trajectory, prediction: Traj
     Point fields: displacement (from rest, in the unit of the positions), node_type, body; von_mises [Pa] at nodes or
     cells, wherever the stress is, and named fields likewise. With a prediction, the geometry is the predicted one, and
     the fields error (vector), error_magnitude, von_mises_error and NAME_error are added: prediction minus truth. Frames
-    that the prediction does not have are left out.
+    that the prediction does not have are left out. The bands of an answer (one number a frame, as in `Answer.figures`)
+    are field data, and so are the notes on its scene; in a `.pvd` file these are a comment, since meshio reads no file
+    with a text.
 
     No half-written file is ever left under the final name.
 
@@ -83,9 +86,15 @@ def _write_pvd(path: Path, elements: np.ndarray, shown: Fields) -> None:
         f'    <DataSet timestep="{time!r}" part="0" file="{html.escape(folder.name)}/{name}"/>'
         for time, name in zip(shown.times.tolist(), names, strict=True)
     ]
-    head = '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1" byte_order="LittleEndian">\n  <Collection>'
+    head = [
+        '<?xml version="1.0"?>',
+        '<VTKFile type="Collection" version="0.1" byte_order="LittleEndian">',
+        "  <Collection>",
+    ]
+    if shown.notes:
+        head.insert(1, f"<!-- notes: {re.sub('-(?=-)', '- ', shown.notes)} -->")  # a comment cannot hold "--"
     with replacing(path) as temporary:
-        temporary.write_text("\n".join([head, *lines, "  </Collection>", "</VTKFile>", ""]), encoding="utf-8")
+        temporary.write_text("\n".join([*head, *lines, "  </Collection>", "</VTKFile>", ""]), encoding="utf-8")
 
 
 def _write_vtu(path: Path, elements: np.ndarray, shown: Fields, frame: int) -> None:
@@ -96,6 +105,18 @@ def _write_vtu(path: Path, elements: np.ndarray, shown: Fields, frame: int) -> N
         cell_data={name: [values[frame]] for name, values in shown.cell.items()},
     )
     meshio.write(path, mesh, file_format="vtu", binary=True)
+    if shown.bands:  # meshio writes no field data
+        head, grid, rest = path.read_bytes().partition(b"<UnstructuredGrid>\n")
+        path.write_bytes(head + grid + _field_data(shown, frame).encode() + rest)
+
+
+def _field_data(shown: Fields, frame: int) -> str:
+    """The bands in a frame, as VTU has what belongs to a frame as a whole."""
+    lines = (
+        f'<DataArray type="Float64" Name="{name}" NumberOfTuples="1" format="ascii">{band[frame]}</DataArray>\n'
+        for name, band in shown.bands.items()
+    )
+    return f"<FieldData>\n{''.join(lines)}</FieldData>\n"
 
 
 @contextlib.contextmanager
@@ -180,3 +201,12 @@ def _write_steps(root: h5py.Group, shown: Fields) -> None:
         for name, values in static.items():
             data[name] = values
             offsets[name] = zero
+    data, offsets = root.create_group("FieldData"), steps.create_group("FieldDataOffsets")
+    for name, values in shown.bands.items():
+        data[name] = values
+        offsets[name] = start
+    if shown.notes:
+        data.create_dataset(
+            "notes", data=[shown.notes.encode()], dtype=h5py.string_dtype("ascii")
+        )  # VTK knows no UTF-8 here
+        offsets["notes"] = zero

@@ -21,6 +21,8 @@ class Fields:
         static: name -> [N], constant in time.
         point: name -> [S, N] or [S, N, c].
         cell: name -> [S, E] or [S, E, c].
+        bands: name -> [S], of the whole answer, as `Answer.figures` has them.
+        notes: what is unusual about the scene of an answer; empty if nothing is known.
     """
 
     position: np.ndarray
@@ -28,6 +30,8 @@ class Fields:
     static: dict[str, np.ndarray]
     point: dict[str, np.ndarray]
     cell: dict[str, np.ndarray]
+    bands: dict[str, np.ndarray]
+    notes: str
 
 
 def fields(truth: Trajectory, prediction: Trajectory | None = None) -> Fields:
@@ -59,7 +63,8 @@ def fields(truth: Trajectory, prediction: Trajectory | None = None) -> Fields:
             place.setdefault(f"{name}_error", _columns(one.values - true.values))
     static = {"node_type": truth.scene.node_type, "body": truth.scene.body}
     times = np.array(shown.numbers if shown.times is None else shown.times, np.float64)
-    return Fields(position, times, static, point, cell)
+    bands = {name: np.array(value, np.float64) for name, value in shown.attributes.items() if name.endswith("_band")}
+    return Fields(position, times, static, point, cell, bands, str(shown.attributes.get("notes", "")))
 
 
 def _columns(values: np.ndarray) -> np.ndarray:

@@ -5,6 +5,7 @@ import random
 import re
 import subprocess
 import sys
+from dataclasses import replace
 
 import h5py
 import meshio
@@ -607,12 +608,15 @@ def test_motion_that_is_lost_nevertheless_is_told(tmp_path):
         read(tmp_path / "r")
 
 
+@pytest.mark.parametrize("suffix", [".vtkhdf", ".pvd"])
 @pytest.mark.parametrize("stress", ["none", "node", "element"])
-def test_our_own_vtkhdf_file_is_read_back(tmp_path, stress):
-    given = trajectory(block(2, 2, 1), 5, stress=stress)
+def test_our_own_files_are_read_back(tmp_path, stress, suffix):
+    """With what an answer knows of itself, too: its notes and its bands."""
+    own = {"notes": "the scene has 18 nodes", "displacement_band": [0.0, 1.0, 2.0, 3.0, 4.0]}
+    given = replace(trajectory(block(2, 2, 1), 5, stress=stress), attributes=own)
     (tmp_path / "r").mkdir()
-    export.write(tmp_path / "r" / "run.vtkhdf", given)
-    found = read(tmp_path / "r" / "run.vtkhdf")
+    export.write(tmp_path / "r" / f"run{suffix}", given)
+    found = read(tmp_path / "r" / f"run{suffix}")
     assert found.stress_location == stress
     np.testing.assert_allclose(found.position, given.position, rtol=0, atol=3e-7)
     np.testing.assert_allclose(found.scene.rest_position, given.scene.rest_position, rtol=0, atol=3e-7)

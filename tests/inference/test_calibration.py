@@ -1,5 +1,6 @@
 """Bands: the quantile of scores, what a calibrated run says, and when it says nothing."""
 
+import csv
 import shutil
 from dataclasses import replace
 
@@ -148,6 +149,34 @@ def test_no_band_where_nothing_is_known(calibrated):
     ):
         with pytest.warns(UserWarning, match=words):
             assert not other.bands(answer, run.effort, ())
+
+
+def test_figures_and_files_of_an_answer_hold_its_bands(calibrated, tmp_path):
+    """They are read without the object that would say how far to trust it."""
+    run, data, _ = calibrated
+    with ast_sim.Dataset(data) as dataset:
+        truth = next(t for t in (dataset["test"][i] for i in range(24)) if not run.predict(t).notes)
+    answer = run.predict(truth, frames=[2, 0, 1])
+    bands = {"displacement_band": answer.band(), "largest_stress_band": answer.band("stress")}
+    assert all(band[1] == 0 and band[0] > 0 and band[2] > 0 and band[0] != band[2] for band in bands.values())
+    for row, figures in enumerate(answer.figures()):
+        assert {name: figures[name] for name in bands} == {name: band[row] for name, band in bands.items()}
+    answer.save(tmp_path / "answer.csv")
+    with (tmp_path / "answer.csv").open() as file:
+        for row, line in enumerate(csv.DictReader(file)):
+            assert {name: float(line[name]) for name in bands} == {name: band[row] for name, band in bands.items()}
+            assert "notes" not in line
+    answer.save(tmp_path / "answer.h5")
+    with ast_sim.Dataset(tmp_path / "answer.h5") as kept:
+        saved = kept["test"][0]
+    for name, band in bands.items():
+        assert saved.attributes[name] == pytest.approx(band[[1, 2, 0]].tolist())  # in ascending order of the frames
+    with pytest.warns(UserWarning, match="prescribed nodes move"):
+        run.predict(truth.scene, {1: (0, 0, -1)}, num_frames=3).save(tmp_path / "far.csv")
+    with (tmp_path / "far.csv").open() as file:
+        lines = list(csv.DictReader(file))
+    assert len(lines) == 3 and all("prescribed nodes move up to 1 m" in line["notes"] for line in lines)
+    assert not any(name in lines[0] for name in bands)
 
 
 def test_what_cannot_be_calibrated_is_refused(calibrated):

@@ -93,6 +93,26 @@ def test_errors_compare_the_frames_with_the_same_numbers(tmp_path, suffix):
         export.write(path, truth, replace(some, frames=(4, 5)))
 
 
+NOTES = 'größer <als> & --move; in training "0 m" ---'
+
+
+@pytest.mark.parametrize("suffix", [".pvd", ".vtkhdf"])
+@pytest.mark.parametrize("notes", [{}, {"notes": NOTES}])
+def test_files_hold_the_bands_of_an_answer_and_its_notes(tmp_path, suffix, notes):
+    bands = {"displacement_band": [0.0, 0.5, 0.1], "reaction_band": [0.0, 1e-12, 3e9]}
+    path = tmp_path / f"a{suffix}"
+    export.write(path, replace(plate(3), attributes={**bands, **notes}))
+    _, meshes = read(path)
+    for frame, mesh in enumerate(meshes):
+        assert {name: mesh.field_data[name].tolist() for name in bands} == {n: [b[frame]] for n, b in bands.items()}
+        if suffix == ".vtkhdf" and notes:
+            assert mesh.field_data["notes"].tolist() == [NOTES]
+    if suffix == ".pvd":
+        comment = '<!-- notes: größer <als> & - -move; in training "0 m" - - - -->'
+        assert (comment in path.read_text(encoding="utf-8")) == bool(notes)
+        assert meshio.read(tmp_path / "a" / "frame_00001.vtu").points.shape == meshes[1].points.shape
+
+
 @pytest.mark.parametrize("suffix", [".pvd", ".vtkhdf"])
 def test_lengths_of_an_answer_stay_in_its_unit(tmp_path, suffix):
     """In millimetres, if its positions are. A file names no unit of length, so it names no metre."""

@@ -51,6 +51,13 @@ def band_of(answer: Answer, quantity: str) -> np.ndarray | None:
     return answer.bands[quantity].around(answer, quantity) if quantity in answer.bands else None
 
 
+def bands_of(answer: Answer) -> dict[str, np.ndarray]:
+    """The bands that an answer has, [S] each, by their names in `Answer.figures` and in files."""
+    known = [name for name in answer.bands if name != "reaction" or not is_stiffer(answer)]
+    figures = {name: "largest_stress" if name == "stress" else name for name in known}
+    return {f"{figures[name]}_band": answer.bands[name].around(answer, name) for name in known}
+
+
 @dataclass(frozen=True)
 class Comparison:
     """The sizes of a quantity in the S computed frames of an answer and in truth, and its errors, each [S]."""

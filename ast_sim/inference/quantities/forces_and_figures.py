@@ -182,10 +182,12 @@ def write_forces(path: Path, forces: list[BodyForce], sets: list[PermanentSet]) 
 
 
 def write_figures(path: Path, answer: Answer) -> None:
-    """Write `Answer.figures` as a table (.csv), a row for each frame, with places relative to the answer's origin."""
+    """Write `Answer.figures` as a table (.csv), a row for each frame, with places relative to the answer's origin, and
+    the notes on the scene in each row: the table is read without the warnings."""
     origin = answer.source.get("origin")
-    figures = figures_of(answer, origin if isinstance(origin, list) else [0.0, 0.0, 0.0])
-    rows = [{"frame": frame, **row} for frame, row in zip(answer.frames, figures, strict=True)]
+    figures = answer.figures(origin if isinstance(origin, list) else [0.0, 0.0, 0.0])
+    notes = {"notes": "; ".join(answer.notes)} if answer.notes else {}
+    rows = [{"frame": frame, **row, **notes} for frame, row in zip(answer.frames, figures, strict=True)]
     sweep_files.write_table(path, rows)
 
 
