@@ -253,6 +253,10 @@ class Motion:
         start, *moved = self._prescribed(scene)
         return max(_largest(after - start) for after in moved)
 
+    def farthest(self, scene: Scene) -> float:
+        """The largest distance of a prescribed node from its place at rest."""
+        return max(map(_largest, self._prescribed(scene) - scene.rest_position[scene.prescribed]), default=0.0)
+
     def extent(self, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
         """[3] and [3]: the lowest and the highest displacement of a prescribed node from its position in frame 0, along
         x, y and z. Frame 0 counts, so the lowest is at most 0."""

@@ -21,6 +21,7 @@ from ast_sim.inference.promises.known_weights import require_known_weights
 from ast_sim.inference.quantities.band import LEVEL, Comparison, compared
 from ast_sim.inference.quantities.relative_errors import QUANTITIES, judging_fields, moves
 from ast_sim.inference.trained_run import Run
+from ast_sim.prescribed_motion import Motion
 from ast_sim.runs.scope import spacing_of
 from ast_sim.scene import Trajectory
 from ast_sim.simulate.jobs.fastest_solver import deepest_frame
@@ -115,13 +116,14 @@ class _Measured(NamedTuple):
     Attributes:
         comparisons: of the quantities in all frames, for each effort with a band; None where the prediction failed.
         errors: of the deepest frame, for each effort among which one is chosen; None where the prediction failed.
-        spacing: as `Calibration` has it.
+        spacing, farthest: as `Calibration` has their ranges.
         latents: [frames, D]; None: the model does not tell.
     """
 
     comparisons: list[dict[str, Comparison] | None]
     errors: list[dict[str, float] | None]
     spacing: float
+    farthest: float
     latents: np.ndarray | None
 
 
@@ -146,13 +148,13 @@ def _measured(
                 scenes.append(_measured_scene(run, truth, name, efforts, to_choose))
             bar.advance(name)
     quantiles, typical = _quantiles([one.comparisons for one in scenes])
-    spacings = [one.spacing for one in scenes]
+    spacings, distances = [one.spacing for one in scenes], [one.farthest for one in scenes]
     latents = [one.latents for one in scenes if one.latents is not None]
     familiarity = Familiarity.of(latents) if len(latents) >= FEWEST else None
     errors_of_efforts = [list(errors) for errors in zip(*(one.errors for one in scenes), strict=True)]
     kept = _kept_errors(to_choose, errors_of_efforts)
-    reach = (min(spacings), max(spacings))
-    return Calibration(len(scenes), efforts, quantiles, typical, reach, kept, familiarity), left_out
+    ranges = (min(spacings), max(spacings)), (min(distances), max(distances))
+    return Calibration(len(scenes), efforts, quantiles, typical, *ranges, kept, familiarity), left_out
 
 
 def _counts(run: Run, truth: Trajectory, name: str) -> bool:
@@ -207,7 +209,8 @@ def _measured_scene(
         _errors_alone(run, truth, name, effort, answer) for effort, answer in zip(to_choose, answers, strict=False)
     ]
     latents = np.stack(list(answers[0].latents.values())) if answers[0].latents else None
-    return _Measured(comparisons, errors, spacing_of(truth.scene), latents)
+    farthest = Motion(truth.position).farthest(truth.scene)
+    return _Measured(comparisons, errors, spacing_of(truth.scene), farthest, latents)
 
 
 def _errors_alone(run: Run, truth: Trajectory, name: str, effort: Effort, whole: Answer) -> dict[str, float] | None:

@@ -130,7 +130,7 @@ def test_no_force_is_promised_where_elements_keep_their_corners_only(pulled, tmp
     assert "the force is not the one of the simulations" in "".join(lines) or not corners
     assert ("reaction" in compared(answer, truth)) != corners
     assert answer.band() is None
-    run.calibration = Calibration(20, (), {}, {}, (0.1, 10.0), KeptErrors((), {}), None)
+    run.calibration = Calibration(20, (), {}, {}, (0.1, 10.0), (0.0, 10.0), KeptErrors((), {}), None)
     if corners:
         with pytest.raises(ast_sim.ConfigError, match=f"no force is promised: {STIFFER}"):
             answer.band("reaction")

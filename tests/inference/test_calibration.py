@@ -146,9 +146,39 @@ def test_no_band_where_nothing_is_known(calibrated):
             "no band: too many calibration scenes failed with 0 corrections",
         ),
         (replace(result, spacing=(1.0, 2.0)), "no band: the mesh edges are .* in the calibration scenes 1 to 2"),
+        (
+            replace(result, farthest=(0.0, 1e-4)),
+            "no band: prescribed nodes move up to .* from their places at rest, in the calibration scenes 0.0001 at mo",
+        ),
     ):
         with pytest.warns(UserWarning, match=words):
             assert not other.bands(answer, run.effort, ())
+
+
+def test_a_band_of_shallow_frames_is_none_of_deep_ones(calibrated):
+    """Ranges of the training include both; the calibration scenes were stored in shallow frames alone."""
+    run, data, result = calibrated
+    with ast_sim.Dataset(data) as dataset:
+        truths = [dataset["test"][index] for index in range(24)]
+    motions = [np.linalg.norm((t.position - t.scene.rest_position)[:, t.scene.prescribed], axis=2) for t in truths]
+    known = [number for number, truth in enumerate(truths) if not run.predict(truth).notes]
+    depths = [motions[number].max() for number in known]
+    assert result.farthest == pytest.approx((min(depths), max(depths)), rel=1e-6)
+    number = known[int(np.argmax(depths))]
+    by_frame = motions[number][1:].max(axis=1)
+    shallow, deep = (1 + int(frame) for frame in (by_frame.argmin(), by_frame.argmax()))
+    assert by_frame.max() > 1.2 * by_frame.min()
+    run.calibration = replace(result, farthest=(0.0, by_frame.min()), familiarity=None)
+    try:
+        assert run.predict(truths[number], frames=[shallow]).band() is not None
+        with pytest.warns(UserWarning, match="no band: prescribed nodes move up to"):
+            assert run.predict(truths[number], frames=[deep]).band() is None
+        kept = KeptErrors((Effort(),), {"displacement": ((0.4,) * 20,)})
+        run.calibration = replace(run.calibration, kept=kept)
+        with pytest.warns(UserWarning, match="no error is promised: prescribed nodes move up to"):
+            assert "promise" not in run.predict(truths[number], frames=[deep], error=0.5).source
+    finally:
+        run.calibration = result
 
 
 def test_figures_and_files_of_an_answer_hold_its_bands(calibrated, tmp_path):
@@ -241,7 +271,7 @@ def test_no_error_is_promised_of_a_smaller_displacement_than_any_in_training(cal
     run, data, result = calibrated
     with ast_sim.Dataset(data) as dataset:
         truth = next(t for t in (dataset["test"][i] for i in range(24)) if not run.predict(t).notes)
-    least = run.scope.travel[0]
+    least = result.farthest[0]
     kept = KeptErrors((Effort(),), {"displacement": ((0.4,) * 20,)})
     run.calibration = replace(result, kept=kept, familiarity=None)
     try:

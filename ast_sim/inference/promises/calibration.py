@@ -25,6 +25,7 @@ from ast_sim.inference.promises.familiarity import Familiarity
 from ast_sim.inference.promises.kept_errors import DISPLACEMENT, KEPT, KeptErrors
 from ast_sim.inference.quantities.band import LEVEL, Band
 from ast_sim.number_arrays import percent
+from ast_sim.prescribed_motion import Motion
 from ast_sim.runs.scope import LEEWAY, spacing_of
 from ast_sim.scene import Scene
 from ast_sim.support.errors import counted, warn
@@ -44,6 +45,7 @@ class Calibration:
             predictions failed.
         typical: of each quantity, the root mean square of its true sizes in these scenes.
         spacing: (lowest, highest) mean length of the mesh edges of the deforming bodies in these scenes.
+        farthest: (lowest, highest) distance by which prescribed nodes leave their places at rest in these scenes.
         kept: the errors of these scenes after each effort.
         familiarity: these scenes as the network sees them; None: the model does not tell.
     """
@@ -53,6 +55,7 @@ class Calibration:
     quantiles: Mapping[str, tuple[float, ...]]
     typical: Mapping[str, float]
     spacing: tuple[float, float]
+    farthest: tuple[float, float]
     kept: KeptErrors = field(default_factory=KeptErrors, repr=False)
     familiarity: Familiarity | None = field(default=None, repr=False)
 
@@ -106,13 +109,13 @@ class Calibration:
             },
             "typical": dict(self.typical),
             "spacing": list(self.spacing),
+            "farthest": list(self.farthest),
             "kept": self.kept.to_json(),
             "familiarity": familiarity,
         }
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> Self:
-        low, high = values["spacing"]
         known = values["familiarity"]
         typical = values["typical"]
         return cls(
@@ -123,7 +126,8 @@ class Calibration:
                 for quantity, widths in values["quantiles"].items()
             },
             typical,
-            (low, high),
+            _range(values["spacing"]),
+            _range(values["farthest"]),
             KeptErrors.from_json(values["kept"]),
             None if known is None else Familiarity.from_json(known),
         )
@@ -141,15 +145,26 @@ class Calibration:
             warn(f"{path} {told}")
             return None
 
-    def unlike(self, scene: Scene, notes: Sequence[str]) -> str:
-        """Why the calibration scenes say nothing of a scene with `notes`; empty if they do."""
-        spacing = spacing_of(scene)
-        low, high = self.spacing
-        if notes:
-            return "the scene is unlike the scenes that the run knows"
-        if not (1 - LEEWAY) * low <= spacing <= (1 + LEEWAY) * high:
-            return f"the mesh edges are {spacing:.3g} long, in the calibration scenes {low:.3g} to {high:.3g}"
+    def unlike(self, scene: Scene, farthest: float) -> str:
+        """Why the calibration scenes say nothing of a scene in which prescribed nodes move so far; empty if they do."""
+        for value, (low, high), text in (
+            (spacing_of(scene), self.spacing, "the mesh edges are {:.3g} long"),
+            (farthest, (0.0, self.farthest[1]), "prescribed nodes move up to {:.3g} from their places at rest"),
+        ):
+            if not (1 - LEEWAY) * low <= value <= (1 + LEEWAY) * high:
+                limits = f"{low:.3g} to {high:.3g}" if low else f"{high:.3g} at most"
+                return f"{text.format(value)}, in the calibration scenes {limits}"
         return ""
+
+    def unlike_errors(self, scene: Scene, farthest: float) -> str:
+        """Why the kept errors, which are shares of the displacement in the deepest frames, say nothing; as `unlike`."""
+        least = self.farthest[0]
+        if farthest >= (1 - LEEWAY) * least:
+            return self.unlike(scene, farthest)
+        return (
+            f"prescribed nodes move up to {farthest:.3g} from their places at rest in the wanted frames, in the"
+            f" calibration scenes {least:.3g} or more; of a smaller displacement the error may be a larger share"
+        )
 
     def compared(self, answer: Answer) -> tuple[float | None, tuple[str, ...]]:
         """The p-value of the scene of an answer, None if it is not known, and a note if the scene is unlike these."""
@@ -157,11 +172,11 @@ class Calibration:
         return p_value, () if self.familiarity is None or p_value is None else self.familiarity.notes(p_value)
 
     def bands(self, answer: Answer, effort: Effort, notes: Sequence[str]) -> dict[str, Band]:
-        """The band of each quantity; none where nothing is known: for a scene with `notes`, which are warnings already;
-        and with a warning that says why, with another effort and on another mesh."""
+        """The band of each quantity; none where nothing is known: for a scene with `notes`, which are warnings already,
+        and with a warning that says why, with another effort, on another mesh, or where nodes are moved farther."""
         if notes:
             return {}
-        why = self.unlike(answer.scene, ())
+        why = self.unlike(answer.scene, Motion(answer.position).farthest(answer.scene))
         if effort not in self.efforts:
             known = counted(len(self.efforts), "effort")
             why = f"the run was calibrated with {known} (run.calibration.efforts), but not with {effort.text}"
@@ -176,3 +191,8 @@ class Calibration:
         """The quantile of each quantity."""
         number = self.efforts.index(effort)
         return {quantity: widths[number] for quantity, widths in self.quantiles.items()}
+
+
+def _range(values: Sequence[float]) -> tuple[float, float]:
+    low, high = values
+    return low, high

@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from ast_sim.inference.effort import Effort, require_effort
+from ast_sim.inference.promises.calibration import Calibration
 from ast_sim.inference.promises.kept_errors import DISPLACEMENT, KEPT, in_words
 from ast_sim.inference.promises.known_weights import forget_other_weights
 from ast_sim.inference.promises.milliseconds import effort_within
 from ast_sim.inference.quantities.forces_and_figures import STIFFER
-from ast_sim.runs.scope import LEEWAY, Scope
+from ast_sim.prescribed_motion import Motion
 from ast_sim.support.errors import ConfigError, warn
 
 if TYPE_CHECKING:
@@ -55,26 +54,19 @@ def _keeping(
     promise = f"the cheapest that keeps {in_words(wanted)} at the deepest frame in {100 * KEPT:g} % of scenes like it"
     facts = []
     for question in questions:
-        why = run.calibration.unlike(question.scene, question.notes) or _too_little(run.scope, question)
+        why = _why_nothing(run.calibration, question)
         if why:
             warn(f"{question.name}: no error is promised: {why}")
         facts.append({"effort": effort.text} if why else {"effort": effort.text, "promise": promise})
     return effort, facts
 
 
-def _too_little(scope: Scope, question: Question) -> str:
-    """Why nothing is known of a share of the displacement where prescribed nodes move less, in the wanted frames, than
-    in any training scene; empty if they do not. The calibration knows the deepest frames of such scenes alone."""
-    scene = question.scene
-    moved = question.prescribed_position[list(question.wanted())] - scene.rest_position
-    travel = float(np.linalg.norm(moved[:, scene.prescribed], axis=2).max(initial=0.0))
-    least = scope.travel[0]
-    if travel >= (1 - LEEWAY) * least:
-        return ""
-    return (
-        f"prescribed nodes move up to {travel:.4g} {scope.length_unit} in the wanted frames, in training {least:.4g}"
-        f" {scope.length_unit} or more; of a smaller displacement the error may be a larger share"
-    )
+def _why_nothing(calibration: Calibration, question: Question) -> str:
+    """Why the kept errors say nothing of a question; empty if they do."""
+    if question.notes:
+        return "the scene is unlike the scenes that the run knows"
+    wanted = Motion(question.prescribed_position[list(question.wanted())])
+    return calibration.unlike_errors(question.scene, wanted.farthest(question.scene))
 
 
 def parse_error(text: str) -> tuple[str, float]:
