@@ -64,7 +64,7 @@ def new_question(
         stress = _given_stress(config, scene, stress, name)
         fields = {} if stress is None else {STRESS: stress}
         times = None
-    _require_resolved(scene, name)  # else a mesh that was rounded flat is said to need a repair
+    _require_resolved(scene, motion, name)  # else a mesh that was rounded flat is said to need a repair
     scene.require_predictable(name)  # before anything is told of such a scene
     _require_material(config, scope, scene, name)
     notes = (
@@ -94,16 +94,20 @@ def scenes_of(scenes: Any, names: Any) -> list[tuple[Scene, Motions, str]]:
     return [(scene, motion, name) for (scene, motion), name in zip(pairs, called, strict=True)]
 
 
-def _require_resolved(scene: Scene, name: str) -> None:
-    """Raise DatasetError if single precision does not tell the nodes apart where the scene lies."""
-    farthest = np.abs(scene.rest_position).max()
-    coarse = float(np.spacing(farthest))
+def _require_resolved(scene: Scene, motion: Motion, name: str) -> None:
+    """Raise DatasetError if single precision does not tell the nodes apart where the scene lies, or moves."""
     spacing = spacing_of(scene)
-    if coarse > LEAST_RESOLVED * spacing > 0:
-        raise DatasetError(
-            f"{name} lies {farthest:.3g} from the origin, where single precision keeps steps of {coarse:.2g}, and its"
-            f" edges have a mean length of {spacing:.2g}: move it to the origin before its positions are rounded"
-        )
+    for positions, what, advice in (
+        (scene.rest_position, "lies", "move it to the origin before its positions are rounded"),
+        (motion.position[:, scene.prescribed], "moves to places", "give a shorter motion"),
+    ):
+        farthest = np.abs(positions).max(initial=0.0)
+        coarse = float(np.spacing(farthest))
+        if coarse > LEAST_RESOLVED * spacing > 0:
+            raise DatasetError(
+                f"{name} {what} {farthest:.3g} from the origin, where single precision keeps steps of {coarse:.2g}, and"
+                f" its edges have a mean length of {spacing:.2g}: {advice}"
+            )
 
 
 def _loose(scene: Scene) -> list[str]:

@@ -189,6 +189,21 @@ def test_positions_that_single_precision_has_rounded_are_refused(plate, axis):
             told(moved, motion + shift)
 
 
+@pytest.mark.parametrize(("distance", "fits"), [(100.0, True), (1e4, False), (1e10, False), (1e30, False)])
+def test_a_motion_to_places_that_single_precision_rounds_is_refused(held, distance, fits):
+    """It was said of 1e10 that elements have no volume: the scene was moved by half of the way and rounded flat."""
+    scene, motion = held
+    far = motion.copy()
+    far[-1, scene.body == 1, 2] -= np.float32(distance)
+    if fits:
+        assert any("prescribed nodes move up to 100 m" in line for line in told(scene, far)[1])
+        return
+    with pytest.raises(
+        DatasetError, match=r"moves to places 1e\+\d\d from the origin, where .*: give a shorter motion"
+    ):
+        told(scene, far)
+
+
 def test_free_nodes_of_no_element_are_told(plate):
     scene, motion = plate
     more = np.float32([[0.01 * k, 0, 0.01] for k in range(3)])
