@@ -231,13 +231,15 @@ def _beam(height: float) -> Question:
 
 def unusual(run: ast_sim.Run, questions: Sequence[Question]) -> dict[str, int]:
     """The number of questions, for the last frame by one call; of them the number outside the ranges of the
-    training, the number that the network finds unlike the calibration scenes, and the number told by either."""
+    training, the number that the network finds unlike the calibration scenes, the number told by either, and the number
+    of answers without a band."""
     answers = [run.predict(*one, frames=[-1], effort=Effort(), throw=False) for one in questions]
     return {
         "questions": len(answers),
         "outside": sum(map(_is_outside, answers)),
         "unlike": sum(map(_is_unlike, answers)),
         "told": sum(bool(one.notes) for one in answers),
+        "no_band": sum(not one.bands for one in answers),
     }
 
 

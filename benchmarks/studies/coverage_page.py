@@ -26,7 +26,8 @@ A wanted error (`predict(error=...)`) is kept if the error of the answer at the 
 promised for 90 of 100 scenes, among the scenes without a warning.
 
 "Either" counts scenes with a warning: scenes outside the ranges of the training, and scenes that the network finds
-unlike the calibration scenes (p-value at most 0.05: by chance one ordinary scene in twenty).
+unlike the calibration scenes (p-value at most 0.05: by chance one ordinary scene in twenty). "No band" counts scenes in
+which prescribed nodes move farther than in the calibration scenes, or whose mesh is another, too.
 """
 
 
@@ -52,7 +53,7 @@ def _section(result: dict[str, Any]) -> list[str]:
         for promise in result["promises"]
     ]
     told = [
-        [kind, *(str(counts[key]) for key in ("questions", "outside", "unlike", "told"))]
+        [kind, *(str(counts[key]) for key in ("questions", "outside", "unlike", "told")), str(counts.get("no_band", "–"))]
         for kind, counts in result["told"].items()
     ]
     return [
@@ -62,7 +63,9 @@ def _section(result: dict[str, Any]) -> list[str]:
         f"{result['calibration_scenes']} calibration scenes. {sum(inside)} of {len(inside)} numbers are as expected.",
         *_table(["effort", "band of", *_COLUMNS], bands, texts=2),
         *_table(["error of", "wanted", "effort", "kept"], promises, texts=1),
-        *_table(["scenes", "number", "outside the training", "unusual to the network", "either"], told, texts=1),
+        *_table(
+            ["scenes", "number", "outside the training", "unusual to the network", "either", "no band"], told, texts=1
+        ),
     ]
 
 
