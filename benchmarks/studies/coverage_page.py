@@ -53,7 +53,7 @@ def _section(result: dict[str, Any]) -> list[str]:
         for promise in result["promises"]
     ]
     told = [
-        [kind, *(str(counts[key]) for key in ("questions", "outside", "unlike", "told")), str(counts.get("no_band", "–"))]
+        [kind, *(str(counts.get(key, "–")) for key in ("questions", "outside", "unlike", "told", "no_band"))]
         for kind, counts in result["told"].items()
     ]
     return [
