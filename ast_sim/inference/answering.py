@@ -14,9 +14,11 @@ from ast_sim.inference.predicting.jump import jumps
 from ast_sim.inference.predicting.question import Question
 from ast_sim.inference.predicting.rollout import rollouts
 from ast_sim.mechanics.physics_check import turned_over
+from ast_sim.models.data_facts import DataFacts
 from ast_sim.models.simulator import Simulator
 from ast_sim.ops import products_in
-from ast_sim.runs.scope import Scope
+from ast_sim.runs.scope import LEEWAY, middle_of, size_of
+from ast_sim.scene import Scene
 from ast_sim.support.errors import counted
 from ast_sim.support.progress import ShowProgress
 
@@ -28,27 +30,26 @@ def answers(
     progress: ShowProgress = False,
 ) -> list[Answer]:
     """Predict the wanted frames of several scenes, by jumps or step by step as the model does; see `jumps` and
-    `rollouts` for the arguments and errors."""
+    `rollouts` for the arguments and errors.
+
+    Scenes are predicted where training scenes lay, since some models read positions, and the answers are given where
+    the scenes lie. A scene that leaves the domain even so is predicted in the middle of the domain.
+    """
     began = time.perf_counter()
+    ways = [_way_back(model.config.data, question) for question in questions]
+    there = [q if way is None else _moved_question(q, way) for q, way in zip(questions, ways, strict=True)]
     with products_in(effort.precision):
         if model.config.scheme.jumps:
-            predicted = jumps(model, questions, effort, progress)
+            predicted = jumps(model, there, effort, progress)
         else:
             effort.check(model.config)
-            predicted = rollouts(model, questions, progress)
+            predicted = rollouts(model, there, progress)
+    back = [
+        answer if way is None else _moved_back(question, answer, way)
+        for question, way, answer in zip(questions, ways, predicted, strict=True)
+    ]
     each = (time.perf_counter() - began) / max(1, len(questions))
-    return [dataclasses.replace(answer, seconds=each) for answer in predicted]
-
-
-def in_place(
-    model: Simulator, scope: Scope, questions: Sequence[Question], effort: Effort, progress: ShowProgress = False
-) -> list[Answer]:
-    """Predict scenes where training scenes lay, since some models read positions, and give the answers where the scenes
-    lie. A scene that leaves the domain even so is predicted in the middle of the domain."""
-    shifts = [_way_back(scope, question) for question in questions]
-    there = [q if shift is None else _moved_question(q, shift) for q, shift in zip(questions, shifts, strict=True)]
-    predicted = zip(questions, shifts, answers(model, there, effort, progress), strict=True)
-    return [answer if shift is None else _moved_back(question, answer, shift) for question, shift, answer in predicted]
+    return [dataclasses.replace(answer, seconds=each) for answer in back]
 
 
 def doubts(answer: Answer) -> list[str]:
@@ -74,13 +75,13 @@ def impossible(answer: Answer) -> list[str]:
     return [f"{over} turned over in frame {frame}, which no body can do (Answer.check)"]
 
 
-def _moved_question(question: Question, shift: np.ndarray) -> Question:
-    scene = dataclasses.replace(question.scene, rest_position=_moved(question.scene.rest_position, shift))
-    return dataclasses.replace(question, scene=scene, prescribed_position=_moved(question.prescribed_position, shift))
+def _moved_question(question: Question, way: np.ndarray) -> Question:
+    scene = dataclasses.replace(question.scene, rest_position=_moved(question.scene.rest_position, way))
+    return dataclasses.replace(question, scene=scene, prescribed_position=_moved(question.prescribed_position, way))
 
 
-def _moved_back(question: Question, answer: Answer, shift: np.ndarray) -> Answer:
-    position = _moved(answer.position, -shift)
+def _moved_back(question: Question, answer: Answer, way: np.ndarray) -> Answer:
+    position = _moved(answer.position, -way)
     given = question.prescribed_position[list(answer.frames)]
     # Given numbers stay what they are, to the last bit.
     known = question.scene.prescribed | ~answer.computed[:, None]
@@ -88,21 +89,28 @@ def _moved_back(question: Question, answer: Answer, shift: np.ndarray) -> Answer
     return dataclasses.replace(answer, scene=question.scene, position=position)
 
 
-def _way_back(scope: Scope, question: Question) -> np.ndarray | None:
-    """[3] float64: the way to a place that the model knows; None: the scene lies there, or stays where it is."""
-    if not question.movable:
-        return None
-    way = scope.way_back(question.scene)
+def _way_back(data: DataFacts, question: Question) -> np.ndarray | None:
+    """[3] float64: the way to a place that the model knows; None: the scene lies there."""
+    way = _way_to_training(data, question.scene)
     position = question.prescribed_position
     known = np.concatenate([position[0], position[:, question.scene.prescribed].reshape(-1, 3)])
     known = known.T.astype(np.float64, order="C")  # rows are reduced faster
     lowest, highest = known.min(axis=1) + way, known.max(axis=1) + way
-    center = np.array(scope.data.domain_center)
-    if max((center - lowest).max(), (highest - center).max()) > scope.data.domain_half_width:
+    center = np.array(data.domain_center)
+    if max((center - lowest).max(), (highest - center).max()) > data.domain_half_width:
         way += center - (lowest + highest) / 2
     return way if way.any() else None
 
 
-def _moved(points: np.ndarray, shift: np.ndarray) -> np.ndarray:
-    """Points [..., 3] float32, moved by `shift` [3] float64 and rounded once."""
-    return (points.astype(np.float64) + shift).astype(np.float32)
+def _way_to_training(data: DataFacts, scene: Scene) -> np.ndarray:
+    """[3] float64: the shortest way to where training scenes lay; zeros if the scene lies there, nearly enough."""
+    if not data.middle_low:
+        return np.zeros(3)
+    middle = middle_of(scene)
+    way = np.clip(middle, data.middle_low, data.middle_high) - middle
+    return way if np.abs(way).max() > LEEWAY * size_of(scene) else np.zeros(3)
+
+
+def _moved(points: np.ndarray, way: np.ndarray) -> np.ndarray:
+    """Points [..., 3] float32, moved by `way` [3] float64 and rounded once."""
+    return (points.astype(np.float64) + way).astype(np.float32)

@@ -73,7 +73,7 @@ def new_question(
         *doubts_at_rest(scene),
         *scope.notes(scene, motion, config.scheme.needs_each_frame),
     )
-    question = Question(name, scene, motion.position, fields, movable=True, notes=notes, times=times)
+    question = Question(name, scene, motion.position, fields, notes=notes, times=times)
     return question.asking(frames)
 
 

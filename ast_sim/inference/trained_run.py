@@ -14,7 +14,7 @@ from ast_sim.dataset.layout import DatasetInfo
 from ast_sim.dataset.reader import Dataset
 from ast_sim.importers.scene_mesh import SceneMesh
 from ast_sim.inference.answer import Answer
-from ast_sim.inference.answering import doubts, in_place
+from ast_sim.inference.answering import answers, doubts
 from ast_sim.inference.assembly_questions import one_question
 from ast_sim.inference.effort import DefaultEffort, Effort, error_with
 from ast_sim.inference.evaluation import SOLVER_SCENES
@@ -272,10 +272,10 @@ class Run:
         for question in questions:
             for note in question.notes:
                 warn(f"{question.name}: {note}")
-        answers = in_place(self.model, self.scope, questions, effort, progress)
+        predicted = answers(self.model, questions, effort, progress)
         seconds = (time.perf_counter() - began) / max(1, len(questions))
         told = []
-        for question, answer, fact in zip(questions, answers, facts, strict=True):
+        for question, answer, fact in zip(questions, predicted, facts, strict=True):
             p_value, unlike = (None, ()) if self.calibration is None else self.calibration.compared(answer)
             notes = (*question.notes, *unlike)
             in_doubt = notes or answer.failure is not None

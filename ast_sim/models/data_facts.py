@@ -32,6 +32,8 @@ class DataFacts:
         young, poisson, contact_range, friction: what the solver recorded, and is the same in all scenes: Young's
             modulus and Poisson's ratio of all elements, distance below which its surfaces repel, coefficient of
             friction; 0: it recorded none, or several.
+        middle_low, middle_high: the lowest and the highest middle of the box around the deforming bodies at rest, along
+            x, y and z; empty in older runs.
     """
 
     integration: Integration = "quasi_static"
@@ -49,6 +51,8 @@ class DataFacts:
     poisson: float = 0.0
     contact_range: float = 0.0
     friction: float = 0.0
+    middle_low: tuple[float, ...] = ()
+    middle_high: tuple[float, ...] = ()
 
     @staticmethod
     def of(
@@ -59,8 +63,10 @@ class DataFacts:
         tetrahedra: bool = True,
         recorded: Mapping[str, float] = NOTHING,
         fields: tuple[tuple[str, str, int, str], ...] = (),
+        middles: tuple[tuple[float, ...], tuple[float, ...]] = ((), ()),
     ) -> DataFacts:
-        """The facts of a dataset with this `info`; `recorded` has the last four, the others are as above."""
+        """The facts of a dataset with this `info`; `recorded` has what the solver recorded, `middles` the lowest and
+        the highest middle, the others are as above."""
         x, y, z = (float(c) for c in info.domain_center)
         return DataFacts(
             integration=info.integration,
@@ -74,6 +80,8 @@ class DataFacts:
             corners_only=info.corners_only,
             tetrahedra=tetrahedra,
             planar=planar,
+            middle_low=middles[0],
+            middle_high=middles[1],
             **recorded,
         )
 

@@ -38,8 +38,6 @@ class Scope:
         usual_increment: the median of that displacement over all frames in which one moves; 0 if none ever does.
         material_low, material_high: the lowest and the highest number of each material column.
         data: what the model knows of its data.
-        middle_low, middle_high: the lowest and the highest middle of the box around the deforming bodies at rest, along
-            x, y and z; empty in older runs.
     """
 
     family: str
@@ -58,8 +56,6 @@ class Scope:
     material_low: tuple[float, ...]
     material_high: tuple[float, ...]
     data: DataFacts
-    middle_low: tuple[float, ...] = ()
-    middle_high: tuple[float, ...] = ()
 
     @property
     def material_ranges(self) -> dict[str, tuple[float, float]]:
@@ -88,14 +84,6 @@ class Scope:
                 yield f"{text.format(shown)}; in training {' to '.join(limits)}"
         if travel <= (1 + LEEWAY) * self.travel[1]:  # else their travel tells it
             yield from self._directions(scene, motion)
-
-    def way_back(self, scene: Scene) -> np.ndarray:
-        """[3] float64: the shortest way to where training scenes lie; zero if the scene lies there already."""
-        if not self.middle_low:
-            return np.zeros(3)
-        middle = middle_of(scene)
-        way = np.clip(middle, self.middle_low, self.middle_high) - middle
-        return way if np.abs(way).max() > LEEWAY * size_of(scene) else np.zeros(3)
 
     def _directions(self, scene: Scene, motion: Motion) -> Iterator[str]:
         """One sentence for each axis along which prescribed nodes move farther than in training."""

@@ -41,6 +41,7 @@ class DataScales:
         recorded: numbers that the solver recorded with all scenes alike, by the name of the fact; see RECORDED. 0:
             it recorded none, or several.
         room: the smallest distance of a node from the boundary of the domain.
+        middles: the lowest and the highest middle of the box around the deforming bodies at rest, along x, y and z.
     """
 
     displacement: float
@@ -52,6 +53,7 @@ class DataScales:
     planar: bool = False
     recorded: Mapping[str, float] = dataclasses.field(default_factory=dict)
     room: float = math.inf
+    middles: tuple[tuple[float, ...], tuple[float, ...]] = ((), ())
 
 
 def measure(dataset: Dataset) -> DataScales:
@@ -71,6 +73,7 @@ def measure(dataset: Dataset) -> DataScales:
     lengths = []
     nodes = []
     constants = []
+    middles = []
     planar = True
     center = np.array(dataset.info.domain_center)
     room = math.inf
@@ -86,6 +89,7 @@ def measure(dataset: Dataset) -> DataScales:
         increment.append(SquaredError.between(position[1:], position[:-1], normal))
         lengths.append(edge_lengths(scene))
         nodes.append(scene.num_nodes)
+        middles.append(middle_of(scene))
         constants.append({key: trajectory.attributes.get(name) for key, name in RECORDED.items()})
         room = min(room, dataset.info.domain_half_width - float(np.abs(position - center).max()))
         planar = planar and not scene.rest_position[:, 2].any() and not position[:, :, 2].any()
@@ -101,6 +105,7 @@ def measure(dataset: Dataset) -> DataScales:
         planar=planar,
         recorded=_alike(constants),
         room=max(0.0, room),
+        middles=(tuple(np.min(middles, axis=0).tolist()), tuple(np.max(middles, axis=0).tolist())),
     )
 
 
@@ -115,7 +120,7 @@ def _alike(constants: list[dict[str, AttributeValue | None]]) -> dict[str, float
 def scope_of(dataset: Dataset, data: DataFacts, mirror: Sequence[str] = ()) -> Scope:
     """The ranges of the training split, measured on the same trajectories, and what the model knows of its data;
     `mirror` names the axes along which the training mirrors scenes."""
-    rows, materials, increments, extents, middles = [], [], [], [], []
+    rows, materials, increments, extents = [], [], [], []
     for _, trajectory in dataset.spread("train", MEASURED):
         scene = trajectory.scene
         motion = Motion(trajectory.position)
@@ -125,7 +130,6 @@ def scope_of(dataset: Dataset, data: DataFacts, mirror: Sequence[str] = ()) -> S
         whole = whole_motion(scene, motion, data.dynamic)
         rows.append((*sizes, whole.travel(scene), max(moves)))
         extents.append(whole.extent(scene))
-        middles.append(middle_of(scene))
         if scene.material is not None:
             materials.append(scene.material[scene.deforming_elements])
     names = ("nodes", "size", "spacing", "held", "travel", "increment")
@@ -145,8 +149,6 @@ def scope_of(dataset: Dataset, data: DataFacts, mirror: Sequence[str] = ()) -> S
         material_low=tuple(material.min(axis=0).tolist()),
         material_high=tuple(material.max(axis=0).tolist()),
         data=data,
-        middle_low=tuple(np.min(middles, axis=0).tolist()),
-        middle_high=tuple(np.max(middles, axis=0).tolist()),
     )
 
 

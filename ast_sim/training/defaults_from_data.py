@@ -48,9 +48,10 @@ def resolve(config: RunConfig, dataset: Dataset, scales: DataScales, keep_model:
         tetrahedra=dataset.element_size != 3,
         recorded=scales.recorded,
         fields=_fields(dataset, config.model.state),
+        middles=scales.middles,
     )
     if keep_model:
-        newer = {"corners_only": facts.corners_only, **scales.recorded}
+        newer = {key: getattr(facts, key) for key in ("corners_only", "middle_low", "middle_high", *scales.recorded)}
         model = dataclasses.replace(config.model, data=dataclasses.replace(config.model.data, **newer))
     else:
         model = config.model.resolve(facts)

@@ -149,7 +149,7 @@ def test_a_scene_far_away_gets_the_same_answer_there(run, tmp_path):
     size = np.linalg.norm(np.ptp(rest, axis=0))
     for shift in ((4.0, -4.0, 2.0), (64.0, -32.0, 16.0)):
         there = with_positions(scene, rest + shift)
-        way = run.scope.way_back(there)
+        way = np.clip(middle_of(there), run.scope.data.middle_low, run.scope.data.middle_high) - middle_of(there)
         known = run.predict(with_positions(scene, rest + shift + way), press, num_frames=frames)
         far = run.predict(there, press, num_frames=frames)
         assert far.scene is there and far.failure is None
@@ -169,26 +169,38 @@ def test_a_scene_is_predicted_where_training_scenes_lay(run, monkeypatch):
     """Models that read positions know no other place. A motion that leaves the domain even there is put into the middle
     of the domain."""
     predicted = []
-    answers = answering.answers
+    jumps = answering.jumps
 
     def kept(model, questions, effort, progress):
         predicted.extend(questions)
-        return answers(model, questions, effort, progress)
+        return jumps(model, questions, effort, progress)
 
-    monkeypatch.setattr(answering, "answers", kept)
+    monkeypatch.setattr(answering, "jumps", kept)
     with Dataset(run.settings.data) as data:
         middles = np.array([middle_of(data["train"][index].scene) for index in range(16)])
-    assert run.scope.middle_low == pytest.approx(middles.min(axis=0))
-    assert run.scope.middle_high == pytest.approx(middles.max(axis=0))
+    assert run.scope.data.middle_low == pytest.approx(middles.min(axis=0))
+    assert run.scope.data.middle_high == pytest.approx(middles.max(axis=0))
     scene = scene_of()
     run.predict(scene, PRESS, num_frames=3)
     assert predicted[-1].scene is scene
     run.predict(with_positions(scene, scene.rest_position + [0.5, 0.1, 0.0]), PRESS, num_frames=3)
-    assert middle_of(predicted[-1].scene)[:2] == pytest.approx(run.scope.middle_high[:2], abs=1e-6)
+    assert middle_of(predicted[-1].scene)[:2] == pytest.approx(run.scope.data.middle_high[:2], abs=1e-6)
     with pytest.warns(UserWarning, match="prescribed nodes move"):  # up to x = 1.15 of 1
         run.predict(scene, {1: (1.1, 0.0, 0.0)}, num_frames=3)
     x = predicted[-1].prescribed_position[:, scene.prescribed, 0]
     assert x.min() == pytest.approx(-x.max()) and x.max() > 0.5
+
+
+def test_scenes_of_a_dataset_that_lie_elsewhere_are_evaluated_as_they_are_predicted(run, test_error, tmp_path):
+    shift = np.float32([0.5, 0, 0])
+    with Dataset(run.settings.data) as data:
+        truths = [data["test"][index] for index in range(3)]
+        with DatasetWriter(tmp_path / "there.h5", replace(data.info, domain_center=(0.5, 0.0, 0.0))) as writer:
+            for truth in truths:
+                scene = with_positions(truth.scene, truth.scene.rest_position + shift)
+                writer.add("test", replace(truth, scene=scene, position=truth.position + shift))
+    evaluated = run.evaluate(tmp_path / "there.h5", solver_scenes=0).figures.error("displacement").rmse_sequence
+    assert evaluated == pytest.approx(test_error, rel=1e-3)
 
 
 def test_several_motions_of_a_scene_are_answered_together(run):

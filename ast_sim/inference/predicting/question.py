@@ -38,7 +38,6 @@ class Question:
             ones are zero.
         frames: the numbers of the frames that are wanted, in the order in which the answer has them; None: all of them,
             the given ones too.
-        movable: the scene may be predicted at a place that the model knows.
         notes: what is unusual about the scene for the model, as sentences.
         times: of all frames of the motion in seconds; None: they are not known.
     """
@@ -48,7 +47,6 @@ class Question:
     prescribed_position: np.ndarray
     fields: Mapping[str, np.ndarray] = field(default_factory=dict)
     frames: tuple[int, ...] | None = None
-    movable: bool = False
     notes: tuple[str, ...] = ()
     times: tuple[float, ...] | None = None
 

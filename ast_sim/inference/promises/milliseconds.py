@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import platformdirs
 import torch
 
-from ast_sim.inference.answering import in_place
+from ast_sim.inference.answering import answers
 from ast_sim.inference.effort import Effort, choices
 from ast_sim.inference.promises.known_weights import weights_hash
 from ast_sim.number_arrays import measured_time
@@ -108,6 +108,6 @@ def _timed(run: Run, question: Question, effort: Effort) -> float:
     seconds = []
     for _ in range(REPEATS + 1):
         began = time.perf_counter()
-        in_place(run.model, run.scope, [question], effort)
+        answers(run.model, [question], effort)
         seconds.append(time.perf_counter() - began)
     return 1000 * statistics.median(seconds[1:])
