@@ -42,6 +42,25 @@ def test_every_comparison_of_bands_is_counted():
     assert numbers(r"In all (\d+) comparisons", README) == (len(levels),)
 
 
+def test_bands_of_plates():
+    plates = results("coverage")["plates"]
+    rows = {row["effort"]: row for row in plates["rows"] if row["quantity"] == "displacement"}
+    once, steps = rows["0 corrections"], rows["0 corrections, up to 10 Newton steps"]
+    held = [row["levels"]["0.95"]["held"] for row in (once, steps)]
+    words = r"with (\d+) new plates, this was true of (\d+) plates after one call, and of\s+(\d+) after Newton steps"
+    assert numbers(words, README) == (once["fresh_scenes"], *held)
+    assert numbers(r"Exactly 95 % would be (\d+)", README) == (round(0.95 * once["fresh_scenes"]),)
+    expected = (plates["calibration_scenes"], *once["levels"]["0.95"]["held_interval_99"])
+    assert (
+        numbers(r"calibrated on (\d+) plates; with so small a number, anything from (\d+) to (\d+)", README) == expected
+    )
+    told = plates["told"]
+    counts = [told[kind]["told"] for kind in ("pressed from below", "pressed sideways", "fresh scenes")]
+    words = r"in (\d+) of 40 scenes in which a plate .* only in (\d+) of 40 .* wrongly in (\d+) of 300 ordinary"
+    (found,) = re.findall(words, README, re.DOTALL)
+    assert [int(count) for count in found] == counts
+
+
 def test_errors_and_times_of_efforts():
     coverage, trade = results("coverage")["plates"], results("trade")["plates400"]["displacement"]["run"]
     rows = re.findall(r"^\| .*? \| ([\d.]+) % \| ([\d.]+) % \| ([\d.]+) % \| (\d+) ms \|$", EFFORTS, re.MULTILINE)
