@@ -63,8 +63,17 @@ def fields(truth: Trajectory, prediction: Trajectory | None = None) -> Fields:
             place.setdefault(f"{name}_error", _columns(one.values - true.values))
     static = {"node_type": truth.scene.node_type, "body": truth.scene.body}
     times = np.array(shown.numbers if shown.times is None else shown.times, np.float64)
-    bands = {name: np.array(value, np.float64) for name, value in shown.attributes.items() if name.endswith("_band")}
-    return Fields(position, times, static, point, cell, bands, str(shown.attributes.get("notes", "")))
+    notes = str(shown.attributes.get("notes", ""))
+    return Fields(position, times, static, point, cell, _bands(shown), notes)
+
+
+def _bands(shown: Trajectory) -> dict[str, np.ndarray]:
+    """The bands of an answer that has kept all its frames, and so a number for each."""
+    return {
+        name: np.array(value, np.float64)
+        for name, value in shown.attributes.items()
+        if name.endswith("_band") and isinstance(value, list) and len(value) == len(shown.position)
+    }
 
 
 def _columns(values: np.ndarray) -> np.ndarray:
