@@ -41,7 +41,7 @@ class Size:
     steps: int
 
 
-FULL = Size(train=1300, valid=20, test=10, steps=4000)  # about 15 minutes on 2 cores
+FULL = Size(train=1300, valid=8, test=10, steps=4000)  # about 15 minutes on 2 cores
 QUICK = Size(train=200, valid=4, test=3, steps=250)  # 1.5 to 2.5 minutes
 
 

@@ -12,6 +12,7 @@ from ast_sim.cli import main
 from ast_sim.dataset.reader import Dataset
 from ast_sim.demo import FULL, KEPT, QUICK, Size, headlines
 from ast_sim.figures import Beside
+from ast_sim.runs.train_config import TrainConfig
 
 TINY = Size(train=1, valid=1, test=1, steps=4)
 NODES = 100
@@ -122,5 +123,6 @@ def test_headlines_are_shares_of_the_trivial_predictors():
 
 
 def test_the_sizes_of_the_demonstration():
-    assert (FULL.train, FULL.valid, FULL.test) == (1300, 20, 10)
+    assert (FULL.train, FULL.valid, FULL.test) == (1300, 8, 10)
+    assert FULL.valid <= TrainConfig().validate_scenes  # a training looks at no others
     assert QUICK.train < FULL.train and QUICK.steps < FULL.steps

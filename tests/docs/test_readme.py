@@ -8,7 +8,7 @@ import forked
 from ast_sim import Dataset
 
 ROOT = Path(__file__).parents[2]
-SMALLER = {'"train": 600, "valid": 10, "test": 10': '"train": 2, "valid": 1, "test": 1', "nodes=400": "nodes=80"}
+SMALLER = {'"train": 600, "valid": 8, "test": 10': '"train": 2, "valid": 1, "test": 1', "nodes=400": "nodes=80"}
 SMALLER |= {"minutes=5": "steps=3", "(14, 24, 34)": "(3, 5, 7)"}
 
 
