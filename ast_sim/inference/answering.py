@@ -36,8 +36,8 @@ def answers(
     the scenes lie. A scene that leaves the domain even so is predicted in the middle of the domain.
     """
     began = time.perf_counter()
-    ways = [_way_back(model.config.data, question) for question in questions]
-    there = [q if way is None else _moved_question(q, way) for q, way in zip(questions, ways, strict=True)]
+    moves = [_way_back(model.config.data, question) for question in questions]
+    there = [q if way is None else _moved_question(q, way) for q, way in zip(questions, moves, strict=True)]
     with products_in(effort.precision):
         if model.config.scheme.jumps:
             predicted = jumps(model, there, effort, progress)
@@ -46,7 +46,7 @@ def answers(
             predicted = rollouts(model, there, progress)
     back = [
         answer if way is None else _moved_back(question, answer, way)
-        for question, way, answer in zip(questions, ways, predicted, strict=True)
+        for question, way, answer in zip(questions, moves, predicted, strict=True)
     ]
     each = (time.perf_counter() - began) / max(1, len(questions))
     return [dataclasses.replace(answer, seconds=each) for answer in back]
