@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,7 +18,8 @@ from ast_sim.runs.config_toml import read_config, read_origin, read_scope
 from ast_sim.runs.metrics import Metrics
 from ast_sim.runs.scope import Scope
 from ast_sim.runs.train_config import RunConfig
-from ast_sim.support.errors import CheckpointError, ConfigError, counted, warn
+from ast_sim.support.disk import output_file
+from ast_sim.support.errors import AstSimError, CheckpointError, ConfigError, counted, warn
 
 _ANSWERS = ("effort", "valid_by_effort")  # what a validation records of answers; it is kept beside the best checkpoint
 
@@ -120,6 +122,22 @@ class RunFolder:
         answers = {**best.answers, "calibration": dict(calibration)}
         checkpoint.mark_best(self.path, best.step, best.error, answers)
         self.chosen = self.chosen._replace(answers=answers)
+
+    def held(self) -> AbstractContextManager[None]:
+        """Within the block nothing trains in the folder, so its best checkpoint stays the one that is measured.
+
+        Raises:
+            CheckpointError: something trains or calibrates there, or no calibration can be kept (`require_best`).
+        """
+        self.require_best()
+        try:
+            output_file(self.path / "best")
+        except AstSimError as error:
+            raise CheckpointError(
+                f"{self.path} cannot be written, so it cannot keep what is measured: calibrate a copy, or a file"
+                " (Run.save) whose band a file that is saved of it keeps"
+            ) from error
+        return checkpoint.lock(self.path)
 
     def forget_answers(self) -> None:
         """From now on nothing is known of answers: the caller has changed the weights. The folder stays as it is."""
