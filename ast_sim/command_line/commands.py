@@ -267,7 +267,8 @@ def sweep(args: argparse.Namespace) -> None:
     from ast_sim.simulate.own_assembly.grid import parse_settings
 
     picture = args.out.with_suffix(".png")
-    for out, what, suffix in ((args.out, "a table", ".csv"), (picture, "a picture", ".png")):
+    part = args.out.with_suffix(".part.csv")
+    for out, what, suffix in ((args.out, "a table", ".csv"), (picture, "a picture", ".png"), (part, "a table", ".csv")):
         check_output(args, out, [args.spec, *filter(None, [args.table])], what, suffix)
     run = open_run(args.run_folder)
     values = parse_settings(args.set)
@@ -278,8 +279,11 @@ def sweep(args: argparse.Namespace) -> None:
         nodes=args.nodes,
         effort=effort_of(args, run.effort),
         error=error_of(args),
+        part=part,
     )
     swept.save(args.out)
+    for old in (part, picture):  # a picture of other rows
+        old.unlink(missing_ok=True)
     print(f"{args.out}: {counted(len(swept.rows), 'row')}, {measured_time(swept.seconds / len(swept.rows))} each")
     if swept.not_converged:
         print(
