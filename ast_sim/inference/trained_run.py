@@ -311,7 +311,7 @@ class Run:
         """
         if data is None and self.path.is_file():
             raise ConfigError(f"{self.path} holds no dataset: name one; the run learned from {self.settings.data}")
-        data = self.settings.data if data is None else data
+        data = self.folder.training_data() if data is None else data
         path = data.absolute_path if isinstance(data, Dataset) else file_name(data, "data")
         dataset = Dataset(path, self.scope.length_unit)
         try:

@@ -19,7 +19,7 @@ from ast_sim.runs.metrics import Metrics
 from ast_sim.runs.scope import Scope
 from ast_sim.runs.train_config import RunConfig
 from ast_sim.support.disk import output_file
-from ast_sim.support.errors import AstSimError, CheckpointError, ConfigError, counted, warn
+from ast_sim.support.errors import AstSimError, CheckpointError, ConfigError, DatasetError, counted, warn
 
 _ANSWERS = ("effort", "valid_by_effort")  # what a validation records of answers; it is kept beside the best checkpoint
 
@@ -179,6 +179,19 @@ class RunFolder:
         same_place = Path(self.settings.data) == dataset.absolute_path
         if same_place and self.origin.get("data") not in (None, dataset.fingerprint()):
             warn(f"{dataset.path} holds other scenes than when {self.path} was trained on it")
+
+    def training_data(self) -> str:
+        """The path of the dataset that trained the run.
+
+        Raises:
+            DatasetError: there is no such file any more.
+        """
+        data = self.settings.data
+        if not Path(data).exists():
+            raise DatasetError(
+                f"{data}, from which {self.path} learned, is not there: name the dataset where it is now"
+            )
+        return data
 
     def scenes(self, split: str) -> list[str]:
         """The hashes (`same_motions`) of the scenes of "train" or "valid" that have trained or chosen the run, and the

@@ -1,4 +1,4 @@
-"""Where the calibration of a run is kept: what would be measured in vain is refused first, and what is lost is told."""
+"""Work that would be in vain is refused before it begins, and what is lost is told: calibrations, datasets, outputs."""
 
 import re
 import shutil
@@ -8,8 +8,10 @@ import pytest
 import toy
 
 import ast_sim
+from ast_sim.cli import main
 from ast_sim.runs import checkpoint
-from ast_sim.support.errors import AstSimError, CheckpointError, ConfigError, TrainingError
+from ast_sim.support.errors import AstSimError, CheckpointError, ConfigError, DatasetError, TrainingError
+from ast_sim.training.start import start_training
 
 SMALL = {"steps": 4, "batch_size": 2, "model": "mgn", "model_settings": {"hidden": 8, "blocks": 1}}
 
@@ -104,3 +106,24 @@ def test_a_run_that_was_moved_while_it_trained_is_named(trained, tmp_path):
     with pytest.raises(TrainingError, match=r"run is gone since the training began: if it was moved, go on with"):
         ast_sim.train(data, run, **SMALL, validate_every=2, log_every=1, callback=move)
     ast_sim.train(data, moved[0], **SMALL, validate_every=2, log_every=1, resume=True)
+
+
+def test_a_dataset_that_is_gone_is_told_with_what_to_do(tmp_path):
+    data = toy.write(tmp_path / "toy.h5", (3, 1, 1))
+    run = ast_sim.train(data, tmp_path / "run", **SMALL)
+    data.rename(tmp_path / "moved.h5")
+    for use in (run.evaluate, run.open, lambda: start_training(run.path, resume=True)):
+        with pytest.raises(DatasetError, match=r"toy.h5, from which .*run learned, is not there: name the dataset"):
+            use()
+    run.open(tmp_path / "moved.h5").close()
+
+
+def test_a_table_of_forces_does_not_replace_the_answer(tmp_path, capsys):
+    """`--out a.csv --forces a.csv` wrote one over the other, and said nothing."""
+    (tmp_path / "a").mkdir()
+    for forces in (tmp_path / "a.csv", tmp_path / "a" / ".." / "a.csv"):
+        words = ["predict", "run", "mesh.vtu", "--out", str(tmp_path / "a.csv"), "--forces", str(forces)]
+        assert main(words) == 2
+        assert "would overwrite the prediction of --out: name another file" in capsys.readouterr().err
+    assert main([*words[:5], "--forces", str(tmp_path / "a.txt")]) == 2
+    assert f"--forces {tmp_path / 'a.txt'}: the name of a table of forces must end in .csv" in capsys.readouterr().err
