@@ -47,8 +47,9 @@ def write_table(path: str | os.PathLike[str], rows: Sequence[Row]) -> None:
 def finished_rows(
     path: str | os.PathLike[str] | None, table: Sequence[Row], rows: int, progress: Progress
 ) -> Iterator[Callable[[], None]]:
-    """Gives a function that writes the finished rows of a sweep, `table`, as CSV now and then. At the end all of them
-    are written; if the block fails or is interrupted, a line says so. Without a path nothing is written.
+    """Gives a function that writes the finished rows of a sweep, `table`, as CSV now and then. The file is there from
+    the beginning; at the end it has all rows. If the block fails or is interrupted, a line says so, and without rows
+    the file is removed. Without a path nothing is written.
 
     Raises:
         AstSimError: the file cannot be written.
@@ -58,6 +59,7 @@ def finished_rows(
         return
     path = file_name(path, "part")
     make_folder(path.parent)
+    write_table(path, [])  # another sweep sees it, and a full disk is told before any work
     due = time.monotonic() + SECONDS_BETWEEN_PARTS
 
     def keep() -> None:
@@ -74,6 +76,8 @@ def finished_rows(
         if table:
             write_table(path, table)
             progress.line(f"stopped: the first {len(table):,} of {counted(rows, 'row')} are in {path}")
+        else:
+            path.unlink(missing_ok=True)
         raise
     write_table(path, table)
 

@@ -124,3 +124,25 @@ def test_no_picture_of_other_rows_stays_beside_a_table(trained, tmp_path):
     assert out.with_suffix(".png").exists()
     assert main([*words, "--set", "travel=1.0", "--overwrite"]) == 0
     assert not out.with_suffix(".png").exists()
+
+
+def test_a_second_sweep_does_not_replace_the_table_of_one_that_goes_on(trained, small_batches, tmp_path, capsys):
+    """Both began when there was no table; 30 rows were replaced by 40, and both said that theirs were written."""
+    spec, run = trained
+    out, part = tmp_path / "force.csv", tmp_path / "force.part.csv"
+    second = []
+
+    def begin(done, total, text):
+        if not second:
+            second.append(main(["sweep", str(run.path), str(spec), "--set", "travel=1,1.1", "--out", str(out)]))
+
+    run.sweep(spec, {"travel": [0.6, 0.7]}, part=part, progress=begin)
+    assert second == [2] and "force.part.csv exists" in capsys.readouterr().err and not out.exists()
+
+
+def test_a_sweep_that_fails_before_its_first_row_leaves_no_file(trained, tmp_path, monkeypatch):
+    spec, run = trained
+    monkeypatch.setattr(ast_sim.Run, "predict_scenes", lambda *_, **__: (_ for _ in ()).throw(MemoryError))
+    with pytest.raises(MemoryError):
+        run.sweep(spec, {"travel": [0.6, 0.7]}, part=tmp_path / "new" / "part.csv", progress=False)
+    assert not list((tmp_path / "new").iterdir())
