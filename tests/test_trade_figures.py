@@ -151,3 +151,14 @@ def test_a_scene_that_neither_answers_speaks_for_nobody():
     slow, fast = (Side(name, (setting(name, 0.01, seconds, 1),)) for name, seconds in (("slow", 0.2), ("fast", 0.01)))
     known = TradeFigures(SCENES, (setting("run", 0.01, 0.1, 1),), (), others=(slow, fast))
     assert known.ahead_of_run == {"fast": [0.1, 0.05, 0.025, 0.01]}
+
+
+@pytest.mark.parametrize(("scenes", "told"), [(1, "1 scene is too few"), (5, "5 scenes are too few"), (6, "")])
+def test_few_scenes_are_told(scenes, told):
+    """One scene had a ratio of 49.96 (49.96 to 49.96). The true median lies beyond all of n ratios in 2 of 2**n cases:
+    in 6 % with 5 scenes, in 3 % with 6."""
+    run, solver = (Setting(name, (0.01,) * scenes, (time,) * scenes) for name, time in (("call", 1.0), ("own", 2.0)))
+    few = TradeFigures(SCENES[:scenes], (run,), (solver,))
+    notes = [note for note in few.notes if "too few" in note]
+    assert [note.split(":")[0] for note in notes] == ([told] if told else [])
+    assert all(note in few.lines() for note in notes)

@@ -127,12 +127,14 @@ def refuse(args: argparse.Namespace, groups: tuple[Any, ...], what: str) -> None
             raise ConfigError(f"{action.option_strings[0]} has no meaning for {what}")
 
 
-def check_output(args: argparse.Namespace, out: Path, inputs: Iterable[Path], what: str = "", *suffixes: str) -> None:
+def check_output(
+    args: argparse.Namespace, out: Path, inputs: Iterable[Path], what: str = "", *suffixes: str, option: str = "--out"
+) -> None:
     """Raise ConfigError if the name of the output does not end as a name of `what` must, or if the output is an input,
     lies in a run, or exists and --overwrite was not given."""
     if suffixes and out.suffix not in suffixes:
         one_of = "one of " if len(suffixes) > 1 else ""
-        raise ConfigError(f"--out {out}: the name of {what} must end in {one_of}{', '.join(suffixes)}")
+        raise ConfigError(f"{option} {out}: the name of {what} must end in {one_of}{', '.join(suffixes)}")
     output_file(out)
     real = Path(os.path.realpath(out))
     for folder in real.parents:
@@ -214,7 +216,9 @@ def predict(args: argparse.Namespace) -> None:
 
     check_output(args, args.out, [args.scene], "a prediction", *SUFFIXES)
     if args.forces is not None:
-        check_output(args, args.forces, [args.scene, args.out], "a table of forces", ".csv")
+        check_output(args, args.forces, [args.scene], "a table of forces", ".csv", option="--forces")
+        if os.path.realpath(args.forces) == os.path.realpath(args.out):
+            raise ConfigError(f"--forces {args.forces} would overwrite the prediction of --out: name another file")
     moves = by_name("--move", map(parse_move, args.move))
     run = open_run(args.run_folder)
     effort = effort_of(args, run.effort)
@@ -268,7 +272,8 @@ def sweep(args: argparse.Namespace) -> None:
     from ast_sim.simulate.own_assembly.grid import parse_settings
 
     picture = args.out.with_suffix(".png")
-    for out, what, suffix in ((args.out, "a table", ".csv"), (picture, "a picture", ".png")):
+    part = args.out.with_suffix(".part.csv")
+    for out, what, suffix in ((args.out, "a table", ".csv"), (picture, "a picture", ".png"), (part, "a table", ".csv")):
         check_output(args, out, [args.spec, *filter(None, [args.table])], what, suffix)
     run = open_run(args.run_folder)
     values = parse_settings(args.set)
@@ -279,8 +284,11 @@ def sweep(args: argparse.Namespace) -> None:
         nodes=args.nodes,
         effort=effort_of(args, run.effort),
         error=error_of(args),
+        part=part,
     )
     swept.save(args.out)
+    for old in (part, picture):  # a picture of other rows
+        old.unlink(missing_ok=True)
     print(f"{args.out}: {counted(len(swept.rows), 'row')}, {measured_time(swept.seconds / len(swept.rows))} each")
     if swept.not_converged:
         print(

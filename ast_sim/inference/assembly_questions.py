@@ -19,7 +19,7 @@ from ast_sim.simulate.own_assembly.grid import required_values
 from ast_sim.simulate.own_assembly.parameters import Values, completed, recorded
 from ast_sim.simulate.own_assembly.spec_reader import read_spec
 from ast_sim.simulate.own_assembly.standing import reference
-from ast_sim.support.errors import ConfigError, warn
+from ast_sim.support.errors import AstSimError, ConfigError, SimulationError, warn
 from ast_sim.support.toml_settings import require_range, whole
 
 NOT_TRAINED = "the run was not trained on a specification, so it is not known how this one differs from its training"
@@ -56,8 +56,29 @@ def ask(
     frames: int | None = None,
     nodes: int | None = None,
 ) -> list[AssemblyQuestion]:
-    """The scenes with these values of the parameters; equal scenes are one object, which is prepared once. A warning
-    tells each of their notes.
+    """The scenes with these values of the parameters, as `questions_of` gives them.
+
+    Raises:
+        ConfigError, SimulationError: as `questions_of`; or a scene cannot be made; the text names the values.
+    """
+    questions = []
+    for one in questions_of(spec, rows, scope, trained, frames, nodes):
+        if isinstance(one, AstSimError):
+            raise one
+        questions.append(one)
+    return questions
+
+
+def questions_of(
+    spec: str | os.PathLike[str],
+    rows: Sequence[Mapping[str, Any]],
+    scope: Scope,
+    trained: Mapping[str, Any] | None,
+    frames: int | None = None,
+    nodes: int | None = None,
+) -> list[AssemblyQuestion | AstSimError]:
+    """The scenes with these values of the parameters; in the place of a scene that cannot be made, why not. Equal
+    scenes are one object, which is prepared once. A warning tells each of their notes.
 
     Args:
         spec: the file of the specification.
@@ -70,7 +91,6 @@ def ask(
     Raises:
         ConfigError: the specification has a mistake, there is no such parameter, its unit is not the run's, or frames
             or nodes are no such number.
-        SimulationError: a scene cannot be made; the text names the values.
     """
     frames, nodes = whole(num_frames=frames, nodes=nodes)
     require_range("num_frames", frames, 2)
@@ -81,12 +101,16 @@ def ask(
             f"{Path(spec).name} has lengths in {read.unit}, but the run was trained in {scope.length_unit}"
         )
     shared = reference(read)
-    questions = []
+    questions: list[AssemblyQuestion | AstSimError] = []
     known = {}
     notes = {}
     for row in rows:
         values = completed(read.parameters, row)
-        case = scene_of(read, values, nodes, read.frames if frames is None else frames, shared).case
+        try:
+            case = scene_of(read, values, nodes, read.frames if frames is None else frames, shared).case
+        except (SimulationError, ConfigError) as error:
+            questions.append(error)
+            continue
         notes |= dict.fromkeys(case.notes())
         arrays = (case.scene.rest_position, case.scene.elements, case.scene.node_type, case.scene.material)
         scene = known.setdefault(tuple(np.asarray(array).tobytes() for array in arrays), case.scene)
@@ -96,6 +120,24 @@ def ask(
     for note in notes:
         warn(note)
     return questions
+
+
+def values_of_rows(spec: str | os.PathLike[str], rows: Sequence[Mapping[str, Any]]) -> list[Values]:
+    """The values of all parameters in each row.
+
+    Raises:
+        ConfigError: the specification has a mistake, or a row names what is no parameter, or has a value that does not
+            fit; the text says which row, where there are several.
+    """
+    read = read_spec(spec)
+    values = []
+    for number, row in enumerate(rows):
+        try:
+            values.append(completed(read.parameters, row))
+        except ConfigError as error:
+            where = f"row {number} (the first one is row 0): " if len(rows) > 1 else ""
+            raise ConfigError(f"{where}{error}") from error
+    return values
 
 
 def one_question(

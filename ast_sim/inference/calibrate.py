@@ -60,27 +60,28 @@ def calibrate(
 
     Raises:
         ConfigError: the split has trained or chosen the run, there are fewer than 19 scenes, or too many fail.
+        CheckpointError: the folder of the run cannot be written, or a process trains in it.
     """
     require_runs(run)
     with run.open(data) as dataset:
         known = _known_scenes(run, dataset, split)
-        run.folder.require_best()  # which will keep the result
         require_known_weights(run, "calibrate")
-        before = run.calibration
-        run.calibration = None  # it has no say in which scenes count
-        try:
-            result, left_out = _measured(run, dataset, split, known, progress)
-        except BaseException:
-            run.calibration = before
-            raise
-    run.calibration = result
+        with run.folder.held():  # which will keep the result
+            before = run.calibration
+            run.calibration = None  # it has no say in which scenes count
+            try:
+                result, left_out = _measured(run, dataset, split, known, progress)
+            except BaseException:
+                run.calibration = before
+                raise
+            run.calibration = result
+            run.folder.keep_calibration(result.to_json())
     if known:
         count = counted(len(known), "scene does", "scenes do")
         warn(f"{count} not count, which have trained or chosen the run; the first is {known[0]}")
     if left_out:
         count = counted(len(left_out), "scene does", "scenes do")
-        warn(f"{count} not count, outside the training or without motion; the first is {left_out[0]}")
-    run.folder.keep_calibration(result.to_json())
+        warn(f"{count} not count, outside the training or without motion; the first is {next(iter(left_out))}")
     if run.path.is_file():
         warn(f"{run.path} is a file, which is not changed: Run.save writes one with the band")
     return result
@@ -129,17 +130,17 @@ class _Measured(NamedTuple):
 
 def _measured(
     run: Run, dataset: Dataset, split: str, known: Sequence[str], progress: ShowProgress
-) -> tuple[Calibration, list[str]]:
-    """The calibration by the scenes of a split without the `known` ones, and the names of the others that do not
-    count."""
+) -> tuple[Calibration, dict[str, str]]:
+    """The calibration by the scenes of a split without the `known` ones, and by name why others do not count."""
     to_choose = choices(run.settings.model, run.settings.train.corrections)
     efforts = to_choose if run.effort in to_choose else (*to_choose, run.effort)
     scenes: list[_Measured] = []
     fields = judging_fields(run.settings.model)
     every = [f"{split}/{index:06d}" for index in range(dataset.count(split))]
     names = {index: name for index, name in enumerate(every) if name not in known}
-    left_out = [name for index, name in names.items() if not _counts(run, dataset.load(split, index, fields), name)]
-    _require_enough(len(every), len(known), len(left_out))
+    reasons = {name: _why_not(run, dataset.load(split, index, fields), name) for index, name in names.items()}
+    left_out = {name: why for name, why in reasons.items() if why}
+    _require_enough(len(every), len(known), left_out)
     with Progress(len(names), "scenes", progress) as bar, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what they tell is counted here
         for index, name in names.items():
@@ -157,19 +158,24 @@ def _measured(
     return Calibration(len(scenes), efforts, quantiles, typical, *ranges, kept, familiarity), left_out
 
 
-def _counts(run: Run, truth: Trajectory, name: str) -> bool:
-    """Whether something moves in a scene, and it lies inside the training."""
-    return moves(truth) and not new_question(run.settings.model, run.scope, truth, None, None, name, None).notes
+def _why_not(run: Run, truth: Trajectory, name: str) -> str:
+    """Why a scene does not count: nothing moves in it, or where it lies outside the training; empty if it counts."""
+    if not moves(truth):
+        return "nothing moves"
+    notes = new_question(run.settings.model, run.scope, truth, None, None, name, None).notes
+    return next(iter(notes), "")
 
 
-def _require_enough(scenes: int, known: int, left_out: int) -> None:
+def _require_enough(scenes: int, known: int, left_out: Mapping[str, str]) -> None:
     """Raise ConfigError if too few of the scenes are left for a band."""
-    if scenes - known - left_out < FEWEST:
-        reasons = {"have trained or chosen the run": known, "lie outside the training or do not move": left_out}
+    if scenes - known - len(left_out) < FEWEST:
+        reasons = {"have trained or chosen the run": known, "lie outside the training or do not move": len(left_out)}
         without = "".join(f", {count} of which {reason}" for reason, count in reasons.items() if count)
+        first = "".join(f" (the first, {name}: {why})" for name, why in list(left_out.items())[:1])
         raise ConfigError(
-            f"a band of {100 * LEVEL:g} % needs at least {FEWEST} calibration scenes, and there are {scenes}{without}:"
-            " make more with generate(..., calibration=N) (--calibration N)"
+            f"a band of {100 * LEVEL:g} % needs at least {FEWEST} calibration scenes, and there are"
+            f" {scenes}{without}{first}: make more with generate(..., calibration=N) (--calibration N)"
+            + (", like the training scenes" if first else "")
         )
 
 

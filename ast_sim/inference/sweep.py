@@ -4,25 +4,26 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 from ast_sim.inference.answer import Answer
 from ast_sim.inference.answering import impossible
-from ast_sim.inference.assembly_questions import ask
+from ast_sim.inference.assembly_questions import AssemblyQuestion, questions_of, values_of_rows
 from ast_sim.inference.effort import Effort
 from ast_sim.inference.promises.chosen_effort import ErrorLimit
 from ast_sim.mechanics.linearised.linearised_contact import STILL
 from ast_sim.models.model_config import ModelConfig
 from ast_sim.runs.scope import Scope
-from ast_sim.simulate.own_assembly.parameters import flattened
+from ast_sim.simulate.own_assembly.parameters import Values, flattened
 from ast_sim.support.argument_checks import file_name
-from ast_sim.support.errors import ConfigError, counted, warn
+from ast_sim.support.errors import AstSimError, ConfigError, counted, warn
 from ast_sim.support.notebook_table import one_line
 from ast_sim.support.progress import Progress, ShowProgress
 from ast_sim.view import sweep_files
 from ast_sim.view.files import make_folder
+from ast_sim.view.sweep_files import finished_rows
 
 TOGETHER = 64  # scenes that are prepared and predicted at a time
 
@@ -36,7 +37,7 @@ class Sweep:
             prescribed node), `reaction` (newton) with its components, `largest_stress` (pascal) and where it is
             (`stress_at_x`, ...), `last_newton_step` (see `Answer.last_steps`), bands of a calibrated run (see
             `Answer.figures`), and `notes` where there are some: what lies outside the training, and elements that are
-            turned over.
+            turned over. Where there is no scene or no prediction, `failure` says why, in place of the figures.
         varied: the names of the parameters that differ between rows.
         length_unit: unit of all lengths.
         seconds: wall seconds of the model alone, for all rows.
@@ -88,6 +89,7 @@ def sweep(
     effort: Effort,
     error: ErrorLimit | None,
     nodes: int | None,
+    part: str | os.PathLike[str] | None,
     progress: ShowProgress,
 ) -> Sweep:
     """Predict the last frame for each row of values.
@@ -99,54 +101,90 @@ def sweep(
     Args:
         predict_scenes: of a `Run`.
         config, scope, trained: of its model, and the scenes and the specification that it was trained on.
-        spec, rows, error, nodes, progress: as in `Run.sweep`.
+        spec, rows, error, nodes, part, progress: as in `Run.sweep`.
         effort: as it is given, or as the error has chosen it.
     """
     if not rows:
         raise ConfigError("a sweep needs at least one row of values")
+    values = values_of_rows(spec, rows)  # a mistake in the last row is told before the first one is predicted
     needs_load_path = config.data.rubs and effort.newton_steps > 0
     frames = None if needs_load_path or config.scheme.follows_motion else 2
     choice = {"effort": effort} if error is None else {"error": error}
-    table = []
-    seconds = 0.0
-    outside: list[str] = []
-    folded: list[str] = []
-    unpromised = 0
-    with Progress(len(rows), "rows", progress) as bar:
+    outcome = _Outcome()
+    with Progress(len(rows), "rows", progress) as bar, finished_rows(part, outcome.table, len(rows), bar) as keep:
         for start in range(0, len(rows), TOGETHER):
-            questions = ask(spec, rows[start : start + TOGETHER], scope, trained, frames, nodes)
+            questions = questions_of(spec, rows[start : start + TOGETHER], scope, trained, frames, nodes)
+            made = [one for one in questions if isinstance(one, AssemblyQuestion)]
             names = [f"row {start + number}" for number in range(len(questions))]
-            wanted = [-2, -1] if needs_load_path and len(questions[0].motion.position) > 2 else [-1]
-            scenes = [(one.scene, one.motion) for one in questions]
+            own = [name for name, one in zip(names, questions, strict=True) if isinstance(one, AssemblyQuestion)]
+            wanted = [-2, -1] if needs_load_path and made and len(made[0].motion.position) > 2 else [-1]
+            scenes = [(one.scene, one.motion) for one in made]
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # told once for all rows
-                answers = predict_scenes(scenes, names=names, frames=wanted, throw=False, progress=False, **choice)
-            for one, answer in zip(questions, answers, strict=True):
-                notes = [*one.notes, *answer.notes]
-                over = impossible(answer)
-                outside += [f"{answer.name}: {note}" for note in notes[:1]]
-                folded += [f"{answer.name}: {text}" for text in over]
-                table.append(_row(one.values, answer, one.origin, [*notes, *over]))
-            unpromised += sum(error is not None and "promise" not in answer.source for answer in answers)
-            seconds += sum(answer.seconds for answer in answers)
+                answers = predict_scenes(scenes, names=own, frames=wanted, throw=False, progress=False, **choice)
+            outcome.unpromised += sum(error is not None and "promise" not in answer.source for answer in answers)
+            outcome.seconds += sum(answer.seconds for answer in answers)
+            predicted = iter(answers)
+            for number, one in enumerate(questions, start):
+                outcome.add(names[number - start], values[number], one, predicted)
             bar.advance(names[-1], len(questions))
-    _tell(len(rows), outside, folded, unpromised)
-    return Sweep(table, _varied(rows, table), scope.length_unit, seconds)
+            keep()
+    outcome.tell()
+    return Sweep(outcome.table, _varied(rows, outcome.table), scope.length_unit, outcome.seconds)
 
 
-def _tell(rows: int, outside: Sequence[str], folded: Sequence[str], unpromised: int) -> None:
-    """Warn, once for all rows, of the ones that are in doubt: a sentence of each row outside the training, and of each
-    with elements that are turned over."""
-    if outside:
-        lie = counted(rows, "row lies", "rows lie")
-        warn(f"{len(outside)} of {lie} outside the training scenes; the first: {outside[0]}")
-    if folded:
-        warn(f"elements are turned over in {len(folded)} of {counted(rows, 'row')}; the first: {folded[0]}")
-    if unpromised:
-        warn(
-            f"no error is promised in {unpromised} of {counted(rows, 'row')}: their mesh or their ranges differ from"
-            " the calibration scenes"
-        )
+@dataclass
+class _Outcome:
+    """The rows so far, and what is to be told of them: a sentence of each row that failed, lies outside the training or
+    has elements that are turned over, why scenes cannot be made, and the number of rows without a promised error."""
+
+    table: list[dict[str, Any]] = field(default_factory=list)
+    failed: list[str] = field(default_factory=list)
+    outside: list[str] = field(default_factory=list)
+    folded: list[str] = field(default_factory=list)
+    unpromised: int = 0
+    seconds: float = 0.0
+    unmade: list[AstSimError] = field(default_factory=list)
+
+    def add(
+        self, name: str, values: Values, question: AssemblyQuestion | AstSimError, predicted: Iterator[Answer]
+    ) -> None:
+        """Add a row; if it has a scene, its answer is the next one."""
+        if isinstance(question, AstSimError):
+            self.unmade.append(question)
+            self.failed.append(f"{name}: {question}")
+            self.table.append({**values, "failure": str(question)})
+            return
+        answer = next(predicted)
+        notes = [*question.notes, *answer.notes]
+        over = impossible(answer)
+        self.outside += [f"{name}: {note}" for note in notes[:1]]
+        self.folded += [f"{name}: {text}" for text in over]
+        row = _row(question.values, answer, question.origin, [*notes, *over])
+        self.failed += [f"{name}: {row['failure']}"] if "failure" in row else []
+        self.table.append(row)
+
+    def tell(self) -> None:
+        """Warn, once for all rows, of the ones that are in doubt.
+
+        Raises:
+            ConfigError, SimulationError: no scene can be made.
+        """
+        rows = len(self.table)
+        if len(self.unmade) == rows:
+            raise self.unmade[0]
+        if self.failed:
+            warn(f"{len(self.failed)} of {counted(rows, 'row')} failed; the first: {self.failed[0]}")
+        if self.outside:
+            lie = counted(rows, "row lies", "rows lie")
+            warn(f"{len(self.outside)} of {lie} outside the training scenes; the first: {self.outside[0]}")
+        if self.folded:
+            warn(
+                f"elements are turned over in {len(self.folded)} of {counted(rows, 'row')}; the first: {self.folded[0]}"
+            )
+        if self.unpromised:
+            of_rows = f"{self.unpromised} of {counted(rows, 'row')}"
+            warn(f"no error is promised in {of_rows}: their mesh or their ranges differ from the calibration scenes")
 
 
 def _row(values: Mapping[str, Any], answer: Answer, origin: Sequence[float], told: Sequence[str]) -> dict[str, Any]:

@@ -193,9 +193,10 @@ class Run:
         effort: Effort | None = None,
         error: ErrorLimit | None = None,
         nodes: int | None = None,
+        part: str | os.PathLike[str] | None = None,
         progress: ShowProgress = True,
     ) -> Sweep:
-        """Predict the last frame of an assembly for many values of its parameters, in batches.
+        """Predict the last frame of an assembly for many values of its parameters, in batches (failures: `Sweep.rows`).
 
         Args:
             spec: the specification of the assembly.
@@ -203,16 +204,15 @@ class Run:
             table: instead of parameters, a CSV file whose first line names parameters, or a list of mappings from names
                 to values.
             effort, error, nodes, progress: as for `predict`; as for `generate`.
+            part: a CSV file for the rows that are finished, written every ten seconds and where the sweep ends.
 
         Raises:
             ConfigError: as for `predict`; or values and a table are both given.
-            SimulationError: a scene cannot be made.
+            SimulationError: no scene can be made.
         """
-        rows = rows_of(parameters, table)
         chosen, _ = chosen_effort(self, [], effort, error)
-        model = self.settings.model
-        trained = self.folder.specification
-        return sweep(self.predict_scenes, model, self.scope, trained, spec, rows, chosen, error, nodes, progress)
+        shared = (self.settings.model, self.scope, self.folder.specification, spec, rows_of(parameters, table))
+        return sweep(self.predict_scenes, *shared, chosen, error, nodes, part, progress)
 
     def predict_scenes(
         self,
@@ -311,7 +311,7 @@ class Run:
         """
         if data is None and self.path.is_file():
             raise ConfigError(f"{self.path} holds no dataset: name one; the run learned from {self.settings.data}")
-        data = self.settings.data if data is None else data
+        data = self.folder.training_data() if data is None else data
         path = data.absolute_path if isinstance(data, Dataset) else file_name(data, "data")
         dataset = Dataset(path, self.scope.length_unit)
         try:

@@ -16,7 +16,17 @@ from ast_sim.batches.frame_pairs import target_counts
 from ast_sim.dataset.reader import Dataset
 from ast_sim.number_arrays import measured_time, percent
 from ast_sim.planning.forecast import Forecast, forecast
-from ast_sim.planning.trials import GROWTH, LONGEST, MINUTES, Trial, Trials, candidates, round_sizes, trial_folder
+from ast_sim.planning.trials import (
+    GROWTH,
+    LONGEST,
+    MINUTES,
+    Trial,
+    Trials,
+    candidates,
+    round_sizes,
+    told_if_stopped,
+    trial_folder,
+)
 from ast_sim.runs.config_toml import write_settings
 from ast_sim.runs.train_config import RunConfig
 from ast_sim.support.argument_checks import file_name, require_type
@@ -144,7 +154,7 @@ def planned(
     sizes = round_sizes(len(tried))
     # As many of the longest trial; one more of them has half of the scenes.
     in_longest = 1 + sum(size / GROWTH**later for later, size in enumerate(reversed(sizes)))
-    with Progress(sum(sizes) + 1, "trials", progress) as bar:
+    with Progress(sum(sizes) + 1, "trials", progress) as bar, told_if_stopped(out, bar):
         bar.line(f"the trials take about {duration(60 * minutes * LONGEST * in_longest)}")
         for trial in trials.rounds(tried, trials.first_steps(tried, minutes)):
             made.append(trial)

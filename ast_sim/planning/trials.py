@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,8 @@ from ast_sim.runs.config_toml import has_config
 from ast_sim.runs.folder import RunFolder
 from ast_sim.runs.train_config import RunConfig
 from ast_sim.support.argument_checks import file_name
-from ast_sim.support.errors import ConfigError, TrainingError, counted
+from ast_sim.support.errors import RESUME, ConfigError, TrainingError, counted
+from ast_sim.support.progress import Progress
 from ast_sim.training.callbacks import Callback
 from ast_sim.training.start import start_training
 
@@ -71,6 +72,11 @@ def candidates(base: RunConfig, preset: str) -> dict[str, RunConfig]:
     return tried
 
 
+def counted_minutes(minutes: float) -> str:
+    """How many minutes there are, such as "1 minute is"."""
+    return "1 minute is" if minutes == 1 else f"{minutes:g} minutes are"
+
+
 def round_sizes(candidates: int) -> list[int]:
     """The number of trials in each round: the better half goes on."""
     sizes = [candidates]
@@ -81,6 +87,16 @@ def round_sizes(candidates: int) -> list[int]:
 
 class _TooSlow(Exception):
     """Steps of which far too few fit into a trial; its argument is the seconds of one."""
+
+
+@contextmanager
+def told_if_stopped(folder: Path, progress: Progress) -> Iterator[None]:
+    """Within the block an interruption is told, with what goes on from there."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        progress.line(f"stopped: the same call goes on with the trials that are in {folder}")
+        raise
 
 
 def trial_folder(out: str | os.PathLike[str]) -> Path:
@@ -127,7 +143,10 @@ class Trials:
         about = f"{name}, {counted(steps, 'step')}" + (f", {counted(scenes, 'scene')}" if scenes else "")
         folder = self.folder / about.replace(", ", "_").replace(" ", "-")
         changed = dataclasses.replace(config, train=options)
-        start_training(folder, changed, resume=True, callback=callback, progress=False)
+        try:
+            start_training(folder, changed, resume=True, callback=callback, progress=False)
+        except TrainingError as error:  # a plan always resumes
+            raise TrainingError(str(error).replace(RESUME, "plan again in the same folder")) from error
         metrics = RunFolder(folder).metrics
         record, seconds = metrics.validation(steps), metrics.seconds_per_step()
         if record is None or record["valid_rmse"] is None or seconds is None:
@@ -156,7 +175,8 @@ class Trials:
         if min(steps.values()) < LEAST:
             least = minutes * LEAST * max(seconds.values()) / first
             raise ConfigError(
-                f"{minutes:g} minutes are too few to plan: the first trials would have {min(steps.values())} steps;"
+                f"{counted_minutes(minutes)} too few to plan: the first trials would have"
+                f" {counted(min(steps.values()), 'step')};"
                 f" plan for {least:.2g} minutes or more, or train at once"
             )
         return steps

@@ -16,11 +16,12 @@ from ast_sim.dataset.solver_seconds import read_seconds
 from ast_sim.inference.effort import Effort
 from ast_sim.inference.trained_run import Run
 from ast_sim.number_arrays import measured_time
-from ast_sim.planning.trials import MINUTES, TIMED, Trials, trial_folder
+from ast_sim.planning.trials import LEAST, MINUTES, TIMED, Trials, counted_minutes, trial_folder
 from ast_sim.scene import Trajectory
 from ast_sim.simulate.jobs.generate import checked_workers, generate
 from ast_sim.simulate.own_assembly.spec_reader import read_spec
 from ast_sim.support.argument_checks import require_type
+from ast_sim.support.errors import ConfigError, counted
 from ast_sim.support.progress import ShowProgress, duration
 from ast_sim.support.toml_settings import require_range
 from ast_sim.training.configure import configure
@@ -96,7 +97,8 @@ def worth(
         nodes, frames, solver, progress: as for `generate`.
 
     Raises:
-        AstSimError: the specification has a mistake, or scenes cannot be solved.
+        AstSimError: the specification has a mistake, scenes cannot be solved, or the minutes are too few for a
+            training.
     """
     require_type("minutes", minutes, Real, "a number")
     require_range("minutes", minutes, *MINUTES)
@@ -114,6 +116,12 @@ def worth(
         truth = dataset["valid"][0]
     trial = Trials(folder, SOLVED - 1, 1).trained("tiny", config, TIMED)
     steps = int(60 * minutes / trial.seconds)
+    if steps < LEAST:
+        raise ConfigError(
+            f"{counted_minutes(minutes)} too few: a training would have {counted(steps, 'step')} of"
+            f" {measured_time(trial.seconds)}, and learns nothing from fewer than {LEAST}; plan for"
+            f" {LEAST * trial.seconds / 60:.2g} minutes or more"
+        )
     options = {"--nodes": nodes, "--frames": frames, "--solver": solver}
     given = [text for key, value in options.items() if value is not None for text in (key, str(value))]
     shown = steps * config.train.batch_size * config.train.accumulate

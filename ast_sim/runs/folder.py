@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,7 +18,8 @@ from ast_sim.runs.config_toml import read_config, read_origin, read_scope
 from ast_sim.runs.metrics import Metrics
 from ast_sim.runs.scope import Scope
 from ast_sim.runs.train_config import RunConfig
-from ast_sim.support.errors import CheckpointError, ConfigError, counted, warn
+from ast_sim.support.disk import output_file
+from ast_sim.support.errors import AstSimError, CheckpointError, ConfigError, DatasetError, counted, warn
 
 _ANSWERS = ("effort", "valid_by_effort")  # what a validation records of answers; it is kept beside the best checkpoint
 
@@ -121,6 +123,22 @@ class RunFolder:
         checkpoint.mark_best(self.path, best.step, best.error, answers)
         self.chosen = self.chosen._replace(answers=answers)
 
+    def held(self) -> AbstractContextManager[None]:
+        """Within the block nothing trains in the folder, so its best checkpoint stays the one that is measured.
+
+        Raises:
+            CheckpointError: something trains or calibrates there, or no calibration can be kept (`require_best`).
+        """
+        self.require_best()
+        try:
+            output_file(self.path / "best")
+        except AstSimError as error:
+            raise CheckpointError(
+                f"{self.path} cannot be written, so it cannot keep what is measured: calibrate a copy, or a file"
+                " (Run.save) whose band a file that is saved of it keeps"
+            ) from error
+        return checkpoint.lock(self.path)
+
     def forget_answers(self) -> None:
         """From now on nothing is known of answers: the caller has changed the weights. The folder stays as it is."""
         self.chosen = self.chosen._replace(answers={})
@@ -161,6 +179,19 @@ class RunFolder:
         same_place = Path(self.settings.data) == dataset.absolute_path
         if same_place and self.origin.get("data") not in (None, dataset.fingerprint()):
             warn(f"{dataset.path} holds other scenes than when {self.path} was trained on it")
+
+    def training_data(self) -> str:
+        """The path of the dataset that trained the run.
+
+        Raises:
+            DatasetError: there is no such file any more.
+        """
+        data = self.settings.data
+        if not Path(data).exists():
+            raise DatasetError(
+                f"{data}, from which {self.path} learned, is not there: name the dataset where it is now"
+            )
+        return data
 
     def scenes(self, split: str) -> list[str]:
         """The hashes (`same_motions`) of the scenes of "train" or "valid" that have trained or chosen the run, and the

@@ -18,6 +18,7 @@ import hashlib
 import json
 import zipfile
 from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -104,6 +105,10 @@ class RunFile(RunFolder):
 
     def require_best(self) -> None:
         """A file has one checkpoint, which is the best one."""
+
+    def held(self) -> AbstractContextManager[None]:
+        """Nothing trains in a file."""
+        return nullcontext()
 
     @property
     def arrays(self) -> dict[str, Tensor]:

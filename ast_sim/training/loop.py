@@ -296,11 +296,17 @@ class Training:
             best = math.inf if before is None else before["valid_rmse"]
         outcome = verdict(validated, best, self.dataset.info.length_unit)
         record = {"step": self.step, **outcome.record, "seconds": seconds}
-        if outcome.error is not None and outcome.error < best:
+        better = outcome.error is not None and outcome.error < best
+        if better:
             self.run.mark_best(record)
         self.log.metrics.append(record)
         self.listener.hear(self.step, {**outcome.record, "valid_seconds": seconds})
         self.progress.line(f"validation after step {self.step:,}: {outcome.text} ({duration(seconds)})")
+        if better and mark is not None and "calibration" in mark.answers:
+            self.progress.line(
+                f"the calibration was of step {mark.step:,} and does not hold for this step, which is better: answers"
+                " have no band until the run is calibrated again"
+            )
 
     def _compare_with_training_scenes(self, validated: list[Validated]) -> None:
         """Say once that the training repeats its data in vain, if it does."""

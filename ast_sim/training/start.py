@@ -190,6 +190,8 @@ def start_training(
         wanted = config or saved
         if wanted is None:
             raise TrainingError(f"{run} holds no run to resume: name the dataset to start one")
+        if config is None:
+            folder.training_data()
         source = None if from_run is None else open_run(from_run)
         with Dataset(wanted.data) as dataset:
             scales = measure(dataset)
@@ -255,9 +257,18 @@ def _explained(run: Path) -> Iterator[None]:
     except BrokenPipeError:  # before the first step
         raise
     except OSError as error:
+        if isinstance(error, FileNotFoundError) and _lay_in(run, error) and not run.is_dir():
+            raise TrainingError(
+                f"{run} is gone since the training began: if it was moved, {RESUME} where it is now"
+            ) from error
         full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
         advice = f": the last checkpoint is complete; make room, then {RESUME}" if full else ""
         raise TrainingError(f"{run}: {error}{advice}") from error
+
+
+def _lay_in(run: Path, error: OSError) -> bool:
+    """Whether an error is about a file of the run."""
+    return isinstance(error.filename, str | os.PathLike) and Path(error.filename).is_relative_to(run)
 
 
 @contextmanager
@@ -326,8 +337,8 @@ def _require_same(run: RunFolder, saved: RunConfig, config: RunConfig, source: R
         if key == "train.processes":
             continue
         raise ConfigError(
-            f"{run.path} was started with {key} = {old!r}, not {new!r}: resume without settings, or train in another"
-            " folder"
+            f"{run.path} was started with {key} = {old!r}, not {new!r}: resume with its settings (on the command line"
+            " leave out the dataset and all settings), or train in another folder"
         )
     start = run.origin.get("start")
     if source is not None and (start is None or Path(start["run"]) != source.path.resolve()):

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import os
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ast_sim.support.argument_checks import file_name
 from ast_sim.support.disk import replacing
-from ast_sim.support.errors import ConfigError, require
-from ast_sim.view.files import explained
+from ast_sim.support.errors import ConfigError, counted, require
+from ast_sim.support.progress import Progress
+from ast_sim.view.files import explained, make_folder
 from ast_sim.view.picture import INK
 
 Row = Mapping[str, Any]
@@ -22,6 +26,7 @@ QUANTITIES = {
     "permanent_set": ("Largest permanent set", ""),  # the picture names the unit of all lengths
 }
 MOST_CURVES = 12
+SECONDS_BETWEEN_PARTS = 10.0
 
 
 def write_table(path: str | os.PathLike[str], rows: Sequence[Row]) -> None:
@@ -36,6 +41,45 @@ def write_table(path: str | os.PathLike[str], rows: Sequence[Row]) -> None:
         writer = csv.DictWriter(file, names, lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
+
+
+@contextlib.contextmanager
+def finished_rows(
+    path: str | os.PathLike[str] | None, table: Sequence[Row], rows: int, progress: Progress
+) -> Iterator[Callable[[], None]]:
+    """Gives a function that writes the finished rows of a sweep, `table`, as CSV now and then. The file is there from
+    the beginning; at the end it has all rows. If the block fails or is interrupted, a line says so, and without rows
+    the file is removed. Without a path nothing is written.
+
+    Raises:
+        AstSimError: the file cannot be written.
+    """
+    if path is None:
+        yield lambda: None
+        return
+    path = file_name(path, "part")
+    make_folder(path.parent)
+    write_table(path, [])  # another sweep sees it, and a full disk is told before any work
+    due = time.monotonic() + SECONDS_BETWEEN_PARTS
+
+    def keep() -> None:
+        nonlocal due
+        began = time.monotonic()
+        if began >= due:
+            write_table(path, table)
+            now = time.monotonic()
+            due = now + max(SECONDS_BETWEEN_PARTS, 20 * (now - began))  # long tables: a twentieth of the time
+
+    try:
+        yield keep
+    except BaseException:
+        if table:
+            write_table(path, table)
+            progress.line(f"stopped: the first {len(table):,} of {counted(rows, 'row')} are in {path}")
+        else:
+            path.unlink(missing_ok=True)
+        raise
+    write_table(path, table)
 
 
 def write_picture(

@@ -10,6 +10,7 @@ import torch
 import toy
 
 from ast_sim import Dataset, generate
+from ast_sim.dataset.writer import DatasetWriter
 from ast_sim.figures import VariantFigures
 from ast_sim.inference.answering import answers
 from ast_sim.inference.effort import Effort, EffortErrors, cheapest_good, mean_errors
@@ -316,3 +317,21 @@ def test_beside_the_solver(tmp_path):
         " meshed: too thin"
     )
     json.dumps(asdict(found), allow_nan=False)
+
+
+def test_scenes_that_do_not_move_are_no_failures(one, tmp_path):
+    """ "Every prediction failed" stood below a table with "failed: 0"; still scenes beside others were not told."""
+    truth = one.load("test", 0)
+    still = replace(truth, position=np.repeat(truth.position[:1], len(truth.position), axis=0))
+    for moving, told in (
+        (0, ["the deepest frame: nothing moves in 2 of 2 scenes, so there is no relative error"]),
+        (1, ["  without 2 of 3 scenes, in which nothing moves"]),
+    ):
+        path = tmp_path / f"{moving}.h5"
+        with DatasetWriter(path, toy.info()) as writer:
+            for trajectory in (*[truth] * moving, still, still):
+                writer.add("test", trajectory)
+        model = Share(replace(toy.config(toy.info()), jumps=True), truth, deepest_frame(truth), 0.75)
+        with Dataset(path) as dataset:
+            found = lines(deepest_frames(model, dataset, "test", Effort()))
+        assert set(told) <= set(found) and not any("failed" in line for line in found)

@@ -90,7 +90,7 @@ def test_calibration_counts_scenes(tmp_path, trained, capfd, monkeypatch):
     with pytest.raises(ConfigError, match="at least 19 calibration scenes, and there are 19, [0-9]+ of which lie outs"):
         calibrate(run, data, "test", progress=told)
     assert not told  # before it begins
-    monkeypatch.setattr("ast_sim.inference.calibrate._counts", lambda *_: True)
+    monkeypatch.setattr("ast_sim.inference.calibrate._why_not", lambda *_: "")
     assert calibrate(run, data, "test", progress=told).scenes == 19
     assert told[-1] == (19, 19, "test/000018") and len(told) == 19
     assert capfd.readouterr() == ("", "")

@@ -15,7 +15,7 @@ from ast_sim.planning.plan import planned
 from ast_sim.planning.trials import Trial, Trials, candidates, round_sizes
 from ast_sim.runs.config_toml import read_config
 from ast_sim.runs.folder import RunFolder
-from ast_sim.support.errors import ConfigError, TrainingError
+from ast_sim.support.errors import RESUME, ConfigError, TrainingError
 from ast_sim.training.configure import configure
 
 SMALL = {"hidden": 16, "decoder_hidden": 16, "d_token": 32, "heads": 2, "head_dim": 16, "ffn_inner": 16}
@@ -202,3 +202,25 @@ def test_minutes_that_are_none_are_refused(data, tmp_path, minutes):
         planned(run_config(data), tmp_path / "plan", minutes)
     with pytest.raises(ConfigError, match="minutes"):
         ast_sim.worth(tmp_path / "SPEC.toml", tmp_path / "worth", minutes)
+
+
+def test_a_stopped_plan_says_how_it_goes_on(data, tmp_path, monkeypatch, caplog):
+    """A trial that stops speaks of --resume, which a plan has not."""
+
+    def full(*_, **__):
+        raise TrainingError(f"the disk is full: make room, then {RESUME}")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "start_training", full)
+        with pytest.raises(TrainingError, match="make room, then plan again in the same folder"):
+            planned(run_config(data), tmp_path / "plan", 2.0, progress=False)
+    monkeypatch.setattr(module, "start_training", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt), caplog.at_level("INFO", "ast_sim"):
+        planned(run_config(data), tmp_path / "plan", 2.0, progress=False)
+    assert caplog.messages[-1] == f"stopped: the same call goes on with the trials that are in {tmp_path / 'plan'}"
+
+
+def test_one_minute_is_one(data, tmp_path, monkeypatch):
+    monkeypatch.setattr(Trials, "trained", lambda *_, **__: SimpleNamespace(seconds=60.0))
+    with pytest.raises(ConfigError, match="1 minute is too few to plan: the first trials would have 0 steps"):
+        planned(run_config(data), tmp_path / "plan", 1.0, progress=False)

@@ -7,7 +7,7 @@ from simulate.own_assembly.assemblies import write_assembly
 
 import ast_sim
 from ast_sim.planning.worth import Worth
-from ast_sim.support.errors import AstSimError
+from ast_sim.support.errors import AstSimError, ConfigError
 
 WORTH = Worth(
     spec="SPEC.toml", minutes=10.0, steps=1000, scenes=100, workers=2, solve_seconds=6.0, answer_seconds=0.5,
@@ -47,3 +47,12 @@ def test_a_specification_with_a_mistake_is_refused(tmp_path):
     spec.write_text(spec.read_text().replace("young", "yuong"))
     with pytest.raises(AstSimError, match="parts.block.young is missing"):
         ast_sim.worth(spec, tmp_path / "worth", 2.0)
+
+
+def test_minutes_without_a_training_are_refused(tmp_path, monkeypatch):
+    """0.001 minutes were 0 steps, and "the model pays after 7 questions"."""
+    spec = write_assembly(tmp_path)
+    with pytest.raises(
+        ConfigError, match=r"0.001 minutes are too few: a training would have [01] steps? of .* than 20"
+    ):
+        ast_sim.worth(spec, tmp_path / "worth", 0.001)

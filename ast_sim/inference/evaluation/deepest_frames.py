@@ -155,8 +155,12 @@ def _steps_to_answer(model: Simulator, question: Question, effort: Effort) -> An
 
 def lines(frames: DeepestFrames) -> list[str]:
     """The most important figures as sentences."""
+    of_all = counted(len(frames.scenes), "scene")
+    still = sum(not scene.displacement for scene in frames.scenes)
+    failed = sum(scene.relative_error is None for scene in frames.scenes) - still
     if frames.relative_error is None or frames.seconds is None:
-        return ["the deepest frame: every prediction failed"]
+        nothing = f"nothing moves in {still} of {of_all}, so there is no relative error" if still else ""
+        return [f"the deepest frame: {'; '.join(filter(None, ['every prediction failed' if failed else '', nothing]))}"]
     after = [f"{100 * error:.3g}" for error in (*frames.after_calls, *frames.after_newton_steps)]
     told = [
         f"the deepest frame at once: error {percent(frames.relative_error, 3)} of the displacement,"
@@ -164,8 +168,10 @@ def lines(frames: DeepestFrames) -> list[str]:
     ]
     if len(after) > 1:
         told.append(f"  after each call, and each Newton step: {', '.join(after)} %")
+    for count, why in ((still, "in which nothing moves"), (failed, "whose prediction failed")):
+        if count:
+            told.append(f"  without {count} of {of_all}, {why}")
     if frames.not_converged:
-        of_all = counted(len(frames.scenes), "scene")
         told.append(f"  in {frames.not_converged} of {of_all} the Newton steps have not converged")
     if frames.stress_share is not None and frames.largest_stress is not None:
         told.append(
