@@ -7,6 +7,7 @@ from statistics import mean, median
 
 import pytest
 
+from ast_sim.trade_figures import TradeFigures
 from benchmarks.studies import clip_page, example_meshes, jumps
 from benchmarks.studies.clip_outcome import Outcome, errors
 from benchmarks.studies.clip_variants import FINER
@@ -141,6 +142,24 @@ def test_the_meshes_of_the_examples():
     rows = results("example_meshes")
     off = [100 * example_meshes.largest_off(rows[name]) for name in ("snap_hook", "bumper")]
     assert shown == tuple(round(value, 1) for value in off) and max(off) < 5
+
+
+def test_products_at_fixed_errors():
+    rows = {
+        name: {row.tolerance: row for row in TradeFigures.from_json(results("trade")[name]["displacement"]).rows}
+        for name in ("bumper", "snap_hook")
+    }
+    hooks, five, one = rows["snap_hook"][0.01], rows["bumper"][0.05], rows["bumper"][0.01]
+    words = r"for hooks within 1 %, one call is (\d+) times \((\d+) to (\d+)\)"
+    assert numbers(words, README) == (round(hooks.ratio), round(hooks.low), round(hooks.high))
+    words = r"for bumpers within 5 %, one call \((\d+) ms\) is (\d+) times \((\d+) to (\d+)\)"
+    assert numbers(words, README) == (
+        round(1000 * five.run.middle),
+        round(five.ratio),
+        round(five.low),
+        round(five.high),
+    )
+    assert f"frame by frame ({one.solver.middle:.2g} s)" in README and one.run is None
 
 
 def test_the_error_of_the_mesh_that_a_trade_estimates():
