@@ -146,19 +146,15 @@ def test_the_meshes_of_the_examples():
 
 def test_products_at_fixed_errors():
     rows = {
-        name: {row.tolerance: row for row in TradeFigures.from_json(results("trade")[name]["displacement"]).rows}
+        name: {row.tolerance: row for row in TradeFigures.from_json(results("trade")[name]["displacement"]).rows()}
         for name in ("bumper", "snap_hook")
     }
     hooks, five, one = rows["snap_hook"][0.01], rows["bumper"][0.05], rows["bumper"][0.01]
     words = r"for hooks within 1 %, one call is (\d+) times \((\d+) to (\d+)\)"
     assert numbers(words, README) == (round(hooks.ratio), round(hooks.low), round(hooks.high))
     words = r"for bumpers within 5 %, one call \((\d+) ms\) is (\d+) times \((\d+) to (\d+)\)"
-    assert numbers(words, README) == (
-        round(1000 * five.run.middle),
-        round(five.ratio),
-        round(five.low),
-        round(five.high),
-    )
+    expected = [round(value) for value in (1000 * five.run.middle, five.ratio, five.low, five.high)]
+    assert numbers(words, README) == tuple(expected)
     assert f"frame by frame ({one.solver.middle:.2g} s)" in README and one.run is None
 
 
