@@ -190,10 +190,8 @@ def start_training(
         wanted = config or saved
         if wanted is None:
             raise TrainingError(f"{run} holds no run to resume: name the dataset to start one")
-        if config is None:
-            folder.training_data()
         source = None if from_run is None else open_run(from_run)
-        with Dataset(wanted.data) as dataset:
+        with Dataset(folder.training_data() if config is None else wanted.data) as dataset:
             scales = measure(dataset)
             fit = partial(resolve, dataset=dataset, scales=scales, keep_model=source is not None)
             shared = {"signals": signals, "processes": processes, "progress": progress}
