@@ -57,7 +57,8 @@ def test_the_table_and_the_chart_show_the_settings(browser, path):
     head = texts(browser, "#trade-tables .table-card:first-child thead th")
     assert head[2:5] == ["The solver", HOSTILE, "Solver / run"]
     assert texts(browser, "#trade-tables h3") == ["Displacement", "Reaction"]
-    ahead, mesh, process = texts(browser, "#trade-tables p")
+    few, ahead, mesh, few_again, process = texts(browser, "#trade-tables p")
+    assert few == few_again and few.startswith("2 scenes are too few: no interval of 95 % comes from fewer than 6")
     assert ahead == f"{HOSTILE} is ahead of the run at 5 % and 2.5 %."
     assert process == f"No Gaussian process: {HOSTILE}."
     assert mesh.startswith("The mesh alone makes the displacement 3 % wrong (median of 3 scenes, against 8 times")
