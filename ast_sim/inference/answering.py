@@ -36,8 +36,8 @@ def answers(
     the scenes lie. A scene that leaves the domain even so is predicted in the middle of the domain.
     """
     began = time.perf_counter()
-    moves = [_way_back(model.config.data, question) for question in questions]
-    there = [q if way is None else _moved_question(q, way) for q, way in zip(questions, moves, strict=True)]
+    shifts = [_shift_to_known_place(model.config.data, question) for question in questions]
+    there = [q if shift is None else _moved_question(q, shift) for q, shift in zip(questions, shifts, strict=True)]
     with products_in(effort.precision):
         if model.config.scheme.jumps:
             predicted = jumps(model, there, effort, progress)
@@ -45,8 +45,8 @@ def answers(
             effort.check(model.config)
             predicted = rollouts(model, there, progress)
     back = [
-        answer if way is None else _moved_back(question, answer, way)
-        for question, way, answer in zip(questions, moves, predicted, strict=True)
+        answer if shift is None else _moved_back(question, answer, shift)
+        for question, shift, answer in zip(questions, shifts, predicted, strict=True)
     ]
     each = (time.perf_counter() - began) / max(1, len(questions))
     return [dataclasses.replace(answer, seconds=each) for answer in back]
@@ -75,13 +75,13 @@ def impossible(answer: Answer) -> list[str]:
     return [f"{over} turned over in frame {frame}, which no body can do (Answer.check)"]
 
 
-def _moved_question(question: Question, way: np.ndarray) -> Question:
-    scene = dataclasses.replace(question.scene, rest_position=_moved(question.scene.rest_position, way))
-    return dataclasses.replace(question, scene=scene, prescribed_position=_moved(question.prescribed_position, way))
+def _moved_question(question: Question, shift: np.ndarray) -> Question:
+    scene = dataclasses.replace(question.scene, rest_position=_moved(question.scene.rest_position, shift))
+    return dataclasses.replace(question, scene=scene, prescribed_position=_moved(question.prescribed_position, shift))
 
 
-def _moved_back(question: Question, answer: Answer, way: np.ndarray) -> Answer:
-    position = _moved(answer.position, -way)
+def _moved_back(question: Question, answer: Answer, shift: np.ndarray) -> Answer:
+    position = _moved(answer.position, -shift)
     given = question.prescribed_position[list(answer.frames)]
     # Given numbers stay what they are, to the last bit.
     known = question.scene.prescribed | ~answer.computed[:, None]
@@ -89,28 +89,28 @@ def _moved_back(question: Question, answer: Answer, way: np.ndarray) -> Answer:
     return dataclasses.replace(answer, scene=question.scene, position=position)
 
 
-def _way_back(data: DataFacts, question: Question) -> np.ndarray | None:
-    """[3] float64: the way to a place that the model knows; None: the scene lies there."""
-    way = _way_to_training(data, question.scene)
+def _shift_to_known_place(data: DataFacts, question: Question) -> np.ndarray | None:
+    """[3] float64: from where the scene lies to a place that the model knows; None: the scene lies there."""
+    shift = _shift_to_training(data, question.scene)
     position = question.prescribed_position
     known = np.concatenate([position[0], position[:, question.scene.prescribed].reshape(-1, 3)])
     known = known.T.astype(np.float64, order="C")  # rows are reduced faster
-    lowest, highest = known.min(axis=1) + way, known.max(axis=1) + way
+    lowest, highest = known.min(axis=1) + shift, known.max(axis=1) + shift
     center = np.array(data.domain_center)
     if max((center - lowest).max(), (highest - center).max()) > data.domain_half_width:
-        way += center - (lowest + highest) / 2
-    return way if way.any() else None
+        shift += center - (lowest + highest) / 2
+    return shift if shift.any() else None
 
 
-def _way_to_training(data: DataFacts, scene: Scene) -> np.ndarray:
-    """[3] float64: the shortest way to where training scenes lay; zeros if the scene lies there, nearly enough."""
+def _shift_to_training(data: DataFacts, scene: Scene) -> np.ndarray:
+    """[3] float64: the shortest shift to where training scenes lay; zeros if the scene lies there, nearly enough."""
     if not data.middle_low:
         return np.zeros(3)
     middle = middle_of(scene)
-    way = np.clip(middle, data.middle_low, data.middle_high) - middle
-    return way if np.abs(way).max() > LEEWAY * size_of(scene) else np.zeros(3)
+    shift = np.clip(middle, data.middle_low, data.middle_high) - middle
+    return shift if np.abs(shift).max() > LEEWAY * size_of(scene) else np.zeros(3)
 
 
-def _moved(points: np.ndarray, way: np.ndarray) -> np.ndarray:
-    """Points [..., 3] float32, moved by `way` [3] float64 and rounded once."""
-    return (points.astype(np.float64) + way).astype(np.float32)
+def _moved(points: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    """Points [..., 3] float32, moved by `shift` [3] float64 and rounded once."""
+    return (points.astype(np.float64) + shift).astype(np.float32)

@@ -48,27 +48,6 @@ class AssemblyQuestion:
         return {**recorded(self.values), "origin": self.origin}
 
 
-def ask(
-    spec: str | os.PathLike[str],
-    rows: Sequence[Mapping[str, Any]],
-    scope: Scope,
-    trained: Mapping[str, Any] | None,
-    frames: int | None = None,
-    nodes: int | None = None,
-) -> list[AssemblyQuestion]:
-    """The scenes with these values of the parameters, as `questions_of` gives them.
-
-    Raises:
-        ConfigError, SimulationError: as `questions_of`; or a scene cannot be made; the text names the values.
-    """
-    questions = []
-    for one in questions_of(spec, rows, scope, trained, frames, nodes):
-        if isinstance(one, AstSimError):
-            raise one
-        questions.append(one)
-    return questions
-
-
 def questions_of(
     spec: str | os.PathLike[str],
     rows: Sequence[Mapping[str, Any]],
@@ -148,7 +127,13 @@ def one_question(
     frames: int | None,
     nodes: int | None,
 ) -> AssemblyQuestion:
-    """The scene with these values of the parameters; None: all are in the middle of their ranges. As `ask`."""
+    """The scene with these values of the parameters; None: all are in the middle of their ranges.
+
+    Raises:
+        ConfigError, SimulationError: as `questions_of`; or the scene cannot be made; the text names the values.
+    """
     values = {} if parameters is None else required_values("parameters", parameters)
-    (question,) = ask(spec, [values], scope, trained, frames, nodes)
+    (question,) = questions_of(spec, [values], scope, trained, frames, nodes)
+    if isinstance(question, AstSimError):
+        raise question
     return question

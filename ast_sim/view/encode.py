@@ -73,7 +73,7 @@ def encode_scene(truth: Trajectory, frames: np.ndarray, predictions: Sequence[Tr
     """One scene: its surface, and the motion of the truth and of each run's prediction at `frames`."""
     for prediction in predictions:
         if prediction is not None:
-            require_same_scene(truth, prediction)
+            require_same_scene(truth.scene, prediction.scene)
             if prediction.numbers != truth.numbers[: prediction.num_frames]:
                 raise AstSimError(
                     f"a page shows frames from the first one on, but the prediction has {ranges(prediction.numbers)}:"

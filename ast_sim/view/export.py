@@ -206,7 +206,6 @@ def _write_steps(root: h5py.Group, shown: Fields) -> None:
         data[name] = values
         offsets[name] = start
     if shown.notes:
-        data.create_dataset(
-            "notes", data=[shown.notes.encode()], dtype=h5py.string_dtype("ascii")
-        )  # VTK knows no UTF-8 here
+        as_ascii = h5py.string_dtype("ascii")  # VTK does not read what is marked as UTF-8; the bytes are the same
+        data.create_dataset("notes", data=[shown.notes.encode()], dtype=as_ascii)
         offsets["notes"] = zero

@@ -42,7 +42,7 @@ def fields(truth: Trajectory, prediction: Trajectory | None = None) -> Fields:
     """
     shown = truth if prediction is None else prediction
     if prediction is not None:
-        require_same_scene(truth, prediction)
+        require_same_scene(truth.scene, prediction.scene)
         truth = truth.select(prediction.numbers)
     position = shown.position
     point = {"displacement": position - truth.scene.rest_position}
@@ -81,9 +81,9 @@ def _columns(values: np.ndarray) -> np.ndarray:
     return values[:, :, 0] if values.shape[2] == 1 else values
 
 
-def require_same_scene(truth: Trajectory, prediction: Trajectory) -> None:
+def require_same_scene(truth: Scene, prediction: Scene) -> None:
     """Raise AstSimError unless both have the same numbers of nodes and elements."""
-    sizes = [(t.scene.num_nodes, t.scene.num_elements) for t in (truth, prediction)]
+    sizes = [(scene.num_nodes, scene.num_elements) for scene in (truth, prediction)]
     if sizes[0] != sizes[1]:
         (n, e), (n_found, e_found) = sizes
         raise AstSimError(

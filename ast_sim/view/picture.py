@@ -45,7 +45,7 @@ def write(
         MissingExtra: matplotlib is not installed.
     """
     path = Path(path)
-    require_same_scene(truth, prediction)
+    require_same_scene(truth.scene, prediction.scene)
     frames = finite_frames(prediction)
     if frames == 0:
         raise AstSimError("the prediction has no frame that could be drawn")

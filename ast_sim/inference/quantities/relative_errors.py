@@ -140,7 +140,7 @@ def require_same_motion(answer: Answer, truth: Trajectory | None, numbers: Seque
     if truth is None:
         return
     require_type("truth", truth, Trajectory, "a Trajectory")
-    require_same_scene(truth, answer.trajectory)
+    require_same_scene(truth.scene, answer.scene)
     unit = None if answer.info is None else answer.info.length_unit
     if unit is not None and truth.length_unit not in (None, unit):
         raise ConfigError(f"{answer.name} is in {unit}, but the truth is in {truth.length_unit}")
